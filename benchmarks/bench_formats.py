@@ -16,7 +16,6 @@ results/formats.csv.
 from __future__ import annotations
 
 import argparse
-import csv
 import dataclasses
 import re
 import shlex
@@ -24,22 +23,19 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple, TextIO
+from typing import Any, NamedTuple
 
 import sundae_ns as sn
-from sundae_ns.core.files import replacing
+from harness.rows import Rows
 from sundae_ns.core.gaussians import bytes_of
 from sundae_ns.head.head import bytes_of_module
 from sundae_ns.plugin.dataparsers import camera_of
 from sundae_ns.plugin.finished_runs import Opened, load_model, load_run
 from sundae_ns.scene.packing import packed_bytes
 
-COLUMNS = (
-    *("capture", "method", "format", "program", "bytes", "psnr", "ssim", "primitives"),
-    *("seed", "command"),
-)
+COLUMNS = tuple("capture method format program bytes psnr ssim primitives seed command".split())
 PLACE = ("capture", "method", "format", "program", "seed")
 """Columns that name a row."""
 OURS = "sundae_ns"
@@ -98,47 +94,15 @@ def rows_of(opened: Opened, method: str, files: Iterator[Packed], scene: sn.Scen
         yield row(loaded, packed.file.suffix, packed.program, packed.file.stat().st_size, packed.command)
 
 
-def place_of(row: dict[str, Any]) -> tuple[str, ...]:
-    """What a row is of: another version of a program takes the place of an earlier one."""
-    return tuple(str(row[name]).split(" ")[0] if name == "program" else str(row[name]) for name in PLACE)
-
-
-def merge_rows(path: Path, rows: Sequence[dict[str, Any]]) -> None:
-    """Write rows into a file, in place of those that they measure again."""
-    measured = set(map(place_of, rows))
-    replace_rows(path, [*(row for row in read_rows(path) if place_of(row) not in measured), *rows], COLUMNS)
-
-
-def read_rows(path: Path | None) -> list[dict[str, Any]]:
-    """The rows of a table; none if there is none yet."""
-    if path is None or not path.exists():
-        return []
-    return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
-
-
-def replace_rows(path: Path, rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> None:
-    """Write a table atomically."""
-    with replacing(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
-        write_rows(file, rows, columns)
-
-
-def write_rows(file: TextIO, rows: Sequence[dict[str, Any]], columns: Sequence[str] = COLUMNS) -> None:
-    writer = csv.DictWriter(file, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, help="folder of a finished run of splatfacto or sundae")
-    parser.add_argument("-o", "--out", type=Path, help="CSV file to put the rows into; by default they are printed")
+    parser.add_argument("-o", "--out", type=Path, help="CSV file to put the rows into")
     parser.add_argument("--data", type=Path, help="the capture, if it has moved")
     parser.add_argument("--method", help="name in the rows; by default the run's method")
     parser.add_argument("--ply", type=Path, nargs="+", default=[], metavar="FILE", help="measure these files instead")
     parser.add_argument("--program", default="other", help="the program that made the files of --ply")
-    parser.add_argument(
-        "--splat-transform", default=shutil.which(OTHER), help="its command, with options if it needs any"
-    )
+    parser.add_argument("--splat-transform", default=shutil.which(OTHER), help="its command, with options if need be")
     options = parser.parse_args()
 
     opened = load_model(options.run, data=options.data)
@@ -147,12 +111,9 @@ def main() -> int:
         files = packed_files(options.run, scene, Path(name), options.data, options.splat_transform)
         if options.ply:
             files = (Packed(file, options.program, f"{options.program} {file.name}") for file in options.ply)
-        rows = list(rows_of(opened, options.method or opened.method, files, scene))
-    if options.out is None:
-        write_rows(sys.stdout, rows)
-    else:
-        merge_rows(options.out, rows)
-        print(f"{options.out}: {len(rows)} rows of {opened.scene}")
+        rows = Rows(options.out, COLUMNS, PLACE)
+        for row in rows_of(opened, options.method or opened.method, files, scene):
+            rows.put(row)
     return 0
 
 

@@ -26,14 +26,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from nerfstudio.cameras.cameras import Cameras
 from numpy.typing import NDArray
 
+import sundae_ns as sn
 from harness.chromium import WEBGPU, Browser, find_chromium, wait_for
 from sundae_ns.io.pack import container
 from sundae_ns.io.pack.packed_scene import CAMERAS as STORED
 from sundae_ns.io.pack.packed_scene import PackedScene, read_scene
-from sundae_ns.plugin.finished_runs import model_of
 from sundae_ns.scene.packing import arrays_of_cameras, scene_of
 from sundae_ns.scene.page import write_page
 
@@ -77,16 +76,9 @@ def write_changed(out: Path, scene: Path, small: PackedScene) -> PackedScene:
 
 def truths(scene: PackedScene) -> list[dict[str, NDArray[np.float32]]]:
     """``rgb`` and ``base_rgb`` of each camera by Python."""
-    model = model_of(scene_of(scene))
-    cameras = arrays_of_cameras(scene_of(scene).cameras)
-    images = []
-    for pose, lens, size in zip(*(cameras[name] for name in ("poses", "intrinsics", "sizes")), strict=True):
-        fx, fy, cx, cy = lens.float().reshape(4, 1, 1)
-        width, height = size.reshape(2, 1, 1)
-        with torch.no_grad():
-            outputs = model.get_outputs(Cameras(pose[None], fx, fy, cx, cy, width, height))
-        images.append({name: outputs[name].numpy() for name in ("rgb", "base_rgb")})
-    return images
+    whole = scene_of(scene)
+    shown = {"rgb": whole, "base_rgb": replace(whole, head=None)}
+    return [{name: sn.render(each, view).rgb.numpy() for name, each in shown.items()} for view in whole.cameras]
 
 
 def image(page: Any, camera: int, head: bool, scale: float = 1.0) -> NDArray[np.float64]:

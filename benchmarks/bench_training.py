@@ -15,6 +15,9 @@ import json
 import subprocess
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -48,18 +51,9 @@ def trainer_of(options: argparse.Namespace, arm: str, out: str) -> Any:
     words += ["--viewer.quit-on-train-completion", "True", "--pipeline.datamanager.cache-images", "gpu"]
     if method != "splatfacto":
         words += ["--pipeline.model.evaluate-prune", "False"]
-    job = Job(
-        key=arm,
-        kind="whole",
-        scene=options.capture.name,
-        arm=arm,
-        data=str(options.capture),
-        method=method,
-        steps=steps_of(options, arm),
-        seed=options.seed,
-        options=(*words, *options.option),
-        parser=parser_of(options.capture),
-    )
+    parser, capture = parser_of(options.capture), options.capture
+    job = Job(arm, "whole", capture.name, arm, str(capture), method, steps_of(options, arm), options.seed)
+    job = replace(job, options=(*words, *options.option), parser=parser)
     config, _ = configure(job, Path(out))
     _set_random_seed(options.seed)
     with without_lpips():
@@ -83,7 +77,8 @@ def quality(trainer: Any) -> tuple[float, float]:
 
 
 def timed(options: argparse.Namespace, arm: str, out: str) -> dict[str, Any]:
-    """Train with the clock running."""
+    """Train with the clock running; the figures of the row."""
+    sys.stdout = sys.stderr  # for what nerfstudio prints in this process
     trainer = trainer_of(options, arm, out)
     curve: list[list[float]] = []
     spent = 0.0
@@ -129,29 +124,15 @@ def main() -> None:
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=["splatfacto", "sundae"])
     parser.add_argument("--steps", type=int, help="by default those of each method")
     parser.add_argument("--seed", type=int, default=42)
-    parser.add_argument(
-        "--curve", type=int, nargs="*", default=[], help="steps after which the test views are measured"
-    )
+    parser.add_argument("--curve", type=int, nargs="*", default=[], help="steps after which test views are measured")
     parser.add_argument("--option", action="append", default=[], help="a further word of ns-train")
     parser.add_argument("-o", "--output", type=Path, help="file to append the lines to")
-    parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.child:
-        with TemporaryDirectory() as out:
-            print("ROW " + json.dumps(timed(options, options.arms[0], out)))
-        return
     for arm in options.arms:
-        steps = steps_of(options, arm)
-        row: dict[str, Any] = {"arm": arm, "scene": options.capture.name, "steps": steps, "seed": options.seed}
-        words = [sys.executable, __file__, str(options.capture), "--arms", arm, "--steps", str(steps), "--child"]
-        words += ["--seed", str(options.seed), "--curve", *map(str, options.curve)]
-        words += [f"--option={word}" for word in options.option]
-        done = subprocess.run(words, check=False, capture_output=True, text=True)
-        lines = [line for line in done.stdout.splitlines() if line.startswith("ROW ")]
-        if not lines:
-            sys.exit(f"{arm} failed:\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}")
-        row |= json.loads(lines[0][4:])
-        row |= {"gpu": torch.cuda.get_device_name(0), "commit": commit()}
+        with TemporaryDirectory() as out, ProcessPoolExecutor(1, get_context("spawn")) as alone:
+            measured = alone.submit(timed, options, arm, out).result()
+        row = {"arm": arm, "scene": options.capture.name, "steps": steps_of(options, arm), "seed": options.seed}
+        row |= {**measured, "gpu": torch.cuda.get_device_name(0), "commit": commit()}
         print(json.dumps(row), flush=True)
         if options.output is not None:
             with options.output.open("a") as file:

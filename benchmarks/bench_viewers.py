@@ -64,10 +64,7 @@ def settings(kind: str, antialiased: bool) -> dict[str, dict[str, Options]]:
             "blur": {"renderer": blur},
             "full precision": {"renderer": exact, "scene": {"extSplats": True}},
         },
-        "gaussianSplats3D": {
-            "default": {},
-            "exact order": {"renderer": sorted_exactly},
-        },
+        "gaussianSplats3D": {"default": {}, "exact order": {"renderer": sorted_exactly}},
         "three": {"default": {}},
         "playcanvas": {
             "default": {},
@@ -95,11 +92,9 @@ def base_colors(scene: PackedScene) -> PackedScene:
 def central(scene: PackedScene) -> PackedScene:
     """The scene with the Gaussians whose centres lie in the images of all cameras."""
     keep = torch.ones(len(scene.gaussians["means"]), dtype=torch.bool)
-    cameras = arrays_of_cameras(scene_of(scene).cameras)
-    for pose, lens, size in zip(*(cameras[name].float() for name in ("poses", "intrinsics", "sizes")), strict=True):
-        x, y, z = ((scene.gaussians["means"] - pose[:, 3]) @ pose[:, :3]).T
-        u, v = lens[0] * x / -z + lens[2], lens[3] - lens[1] * y / -z
-        keep &= (z < 0) & (u > 0) & (u < size[0]) & (v > 0) & (v < size[1])
+    for camera in scene_of(scene).cameras:
+        x, y, z = camera.K.float() @ (scene.gaussians["means"] @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]).T
+        keep &= (z > 0) & (x > 0) & (x < z * camera.width) & (y > 0) & (y < z * camera.height)
     return replace(scene, gaussians={name: value[keep] for name, value in scene.gaussians.items()})
 
 

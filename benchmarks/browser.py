@@ -19,6 +19,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -69,22 +70,20 @@ def main() -> None:
                 wait_for(lambda: last_step(server.output()) > PRUNE_AT, "the prune", 300)
                 page.press("Hide Train Cams")
                 outputs = page.options("Output type")
-                acts = itertools.cycle(
+                acts: Any = itertools.cycle(
                     [
-                        *(lambda name=name: page.choose("Output type", name) for name in outputs),
-                        lambda: page.choose("Output type", outputs[0]),
-                        lambda: page.tick("Neural compensation", False),
-                        lambda: page.slide("Keep ratio", 0.3),
-                        lambda: page.slide("Keep ratio", 0.05),
-                        lambda: page.slide("Keep ratio", 1.1),
-                        lambda: page.tick("Neural compensation", True),
+                        *((page.choose, "Output type", name) for name in (*outputs, outputs[0])),
+                        (page.tick, "Neural compensation", False),
+                        *((page.slide, "Keep ratio", ratio) for ratio in (0.3, 0.05, 1.1)),
+                        (page.tick, "Neural compensation", True),
                     ]
                 )
                 start, first_step = time.monotonic(), last_step(server.output())
                 samples, arrived, acted, next_act = [], [len(page.images)], 0, start
                 while (now := time.monotonic()) < start + options.seconds:
                     if now >= next_act:
-                        next(acts)()
+                        act, *words = next(acts)
+                        act(*words)
                         acted, next_act = acted + 1, now + 5
                     page.drag(200, 250, 200 + chance.uniform(-80, 80), 250 + chance.uniform(-30, 30), seconds=0.5)
                     samples.append((now - start, resident(server.process.pid), last_step(server.output())))

@@ -37,14 +37,7 @@ print(json.dumps({
     "methods": sorted(p.name for p in points if p.load().config.method_name == p.name and p.name in all_methods),
 }))
 """
-PLY = """
-import sys, torch
-from pathlib import Path
-from sundae_ns.scene.initialization import from_points
-from sundae_ns.io.ply import write_ply
-points = torch.rand(200, 3)
-write_ply(Path(sys.argv[1]), from_points(points, points, sh_degree=1, num_features=0))
-"""
+PLY = "import sys, torch, sundae_ns as sn; p = torch.rand(200, 3); sn.save(sn.Scene.from_points(p, p), sys.argv[1])"
 SCRIPT = """#!{python}
 import sys
 from nerfstudio.scripts.train import entrypoint
@@ -55,13 +48,11 @@ sys.exit(entrypoint())
 def run(*words: object, cwd: Path, **variables: str) -> str:
     """What a command prints, without the variables of this Python; ends the script if the command fails."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")} | variables
-    result = subprocess.run(
-        [str(word) for word in words], cwd=cwd, env=environment, capture_output=True, text=True, check=False
-    )
+    command = [str(word) for word in words]
+    result = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, check=False)
     if result.returncode != 0:
-        raise SystemExit(
-            f"{' '.join(map(str, words))}\nfailed in {cwd} with {result.returncode}:\n{result.stdout}\n{result.stderr}"
-        )
+        output = f"{result.stdout}\n{result.stderr}"
+        raise SystemExit(f"{' '.join(command)}\nfailed in {cwd} with {result.returncode}:\n{output}")
     return result.stdout
 
 
@@ -151,8 +142,7 @@ def main() -> None:
             for path in (sdist, wheel):
                 shutil.copy(path, options.keep)
         about = {"bytes": wheel.stat().st_size, "python": sys.version.split()[0], "methods": len(methods)}
-        result = {"wheel": wheel.name, **about, "demo_steps": options.demo_steps}
-    print(json.dumps(result))
+    print(json.dumps({"wheel": wheel.name, **about, "demo_steps": options.demo_steps}))
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ Cameras found in the clean field stand for those of photos: floaters are planted
 """
 
 import argparse
-import csv
 import dataclasses
 import math
 from collections.abc import Iterator, Sequence
@@ -17,11 +16,13 @@ import torch
 from torch import Tensor
 
 import sundae_ns as sn
+from harness.rows import Rows
 from sundae_ns.scene.prune_scene import floater_mask
 from sundae_ns.scene.virtual_cameras import middle_and_reach, usable
 
 PLANTED, HELD_OUT = 100, 12  # floaters of each kind, and cameras
 KINDS = ("near", "shell", "haze", "spikes")
+COLUMNS = ("field", "kind", "planted", "removed", "others_removed", "psnr_lost")
 
 
 def points_in_front(
@@ -90,13 +91,10 @@ def main() -> None:
     parser.add_argument("fields", nargs="+", type=Path)
     parser.add_argument("-o", "--out", type=Path, required=True)
     options = parser.parse_args()
-    with options.out.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(("field", "kind", "planted", "removed", "others_removed", "psnr_lost"))
-        for path in options.fields:
-            for row in rows_of(path):
-                writer.writerow(row)
-                print(*row, flush=True)
+    rows = Rows(options.out, COLUMNS, COLUMNS[:2])
+    for path in options.fields:
+        for row in rows_of(path):
+            rows.put(dict(zip(COLUMNS, row, strict=True)))
 
 
 if __name__ == "__main__":

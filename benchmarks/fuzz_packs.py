@@ -26,16 +26,18 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import torch
+from bench_page import WEB, bundled
 
+import sundae_ns as sn
 from harness.pack_changes import Json, Pack, mutated
 from sundae_ns.core.errors import SundaeError
+from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.head.head import CompensationHead, HeadConfig
-from sundae_ns.io.pack.packed_scene import PackedScene, read_scene, write_scene
+from sundae_ns.io.pack.packed_scene import read_scene
 from sundae_ns.scene.initialization import from_points
-from sundae_ns.scene.packing import scene_of
+from sundae_ns.scene.packing import packed_bytes, scene_of
 from sundae_ns.scene.page import page_of
 
-WEB = Path(__file__).parents[1] / "web"
 SECONDS = 60  # time limit of one verdict; it takes milliseconds, so only a hang reaches it, and ends the script
 POINTS = 60
 LENS = ("fx", "fy", "cx", "cy", "width", "height")
@@ -50,50 +52,43 @@ class Verdict(NamedTuple):
     """Whether the reader ended with an error that is not its own."""
 
 
-def scenes(folder: Path) -> list[Pack]:
+def scenes() -> list[Pack]:
     """Small scenes of every kind: harmonics, logits, antialiased, and both heads."""
     residual, features = ("residual", 1, 3), ("features", 2, 4)
     kinds = [(3, None), (0, None), (1, residual), (4, None), (1, features), (2, None)]
-    return [Pack.of(_scene(folder / f"{i}.sundae", *kind)) for i, kind in enumerate(kinds)]
+    return [Pack.of(packed_bytes(_scene(*kind))) for kind in kinds]
 
 
-def _scene(path: Path, degree: int, kind: tuple[Any, int, int] | None) -> bytes:
+def _scene(degree: int, kind: tuple[Any, int, int] | None) -> sn.Scene:
     torch.manual_seed(degree)
-    points = torch.rand(POINTS, 3) - 0.5
-    width = kind[2] if kind else 1
+    points, width = torch.rand(POINTS, 3) - 0.5, kind[2] if kind else 1
     made = from_points(points, torch.rand(POINTS, 3), sh_degree=degree, num_features=width)
-    gaussians = {name: value.detach() for name, value in made.items()}
+    gaussians = {name: value.detach() for name, value in made.items() if kind or name != "features"}
     gaussians["features_rest"] = 0.2 * torch.randn(POINTS, (degree + 1) ** 2 - 1, 3)
     gaussians["quats"] = torch.randn(POINTS, 4)
-    head, stated = {}, None
-    if kind is None:
-        gaussians.pop("features")
-    else:
+    head = None
+    if kind is not None:
         gaussians["features"] = torch.randn(POINTS, width)
-        config = HeadConfig(mode=kind[0], size="tiny", pixel_unshuffle=kind[1], num_features=width)
-        weights = CompensationHead(config).state_dict()
-        # Few weights that are not zero: zeros decode fast.
-        head = {name: value * (torch.rand_like(value) < 0.002) for name, value in weights.items()}
-        names = ("mode", "size", "pixel_unshuffle", "num_features", "precision")
-        stated = {name: getattr(config, name) for name in names}
-    poses = torch.eye(4)[:3].repeat(2, 1, 1)
-    poses[:, 2, 3] = torch.tensor([2.0, 0.3])
-    lens = torch.tensor([[20.0, 21.0, 12.0, 9.0]]).double().repeat(2, 1)
-    cameras = {"poses": poses, "intrinsics": lens, "sizes": torch.tensor([[24, 18]]).repeat(2, 1)}
-    model = {
-        "sh_degree": degree,
-        "rasterize_mode": "antialiased" if degree == 4 else "classic",
-        "background_color": ("black", "white", "random")[degree % 3],
-        "head": stated,
-        "trained_focal": [20.0, 21.0] if stated else None,
-    }
-    frame = {"transform": torch.eye(4).tolist(), "scale": 1.0}
-    meta = {"model": model, "source": {"method": "sundae", "step": 9}, "frame": frame}
-    if degree % 2:
-        meta["up"] = [0.6, 0.0, -0.8]
-        meta["start"] = {"pose": poses[1].tolist(), "intrinsics": lens[1].tolist(), "size": [24, 18]}
-    write_scene(path, PackedScene(gaussians, head, cameras, meta))
-    return path.read_bytes()
+        head = CompensationHead(HeadConfig(mode=kind[0], size="tiny", pixel_unshuffle=kind[1], num_features=width))
+        for value in head.parameters():  # few that are not zero: zeros decode fast
+            value.data *= torch.rand_like(value) < 0.002
+    pose = torch.eye(4)
+    pose[2, 3] = 2.0
+    near = pose.clone()
+    near[2, 3] = 0.3
+    cameras = tuple(sn.Camera.from_pose(each, (20.0, 21.0, 12.0, 9.0), 24, 18) for each in (pose, near))
+    return sn.Scene(
+        Gaussians(gaussians, "harmonics" if degree else "logits"),
+        head,
+        background_color=("black", "white", "random")[degree % 3],  # type: ignore[arg-type]
+        antialiased=degree == 4,
+        trained_focal=(20.0, 21.0) if head else None,
+        cameras=cameras,
+        up=(0.6, 0.0, -0.8) if degree % 2 else None,
+        start=cameras[1] if degree % 2 else None,
+        in_model_frame=True,
+        meta={"source": {"method": "sundae", "step": 9}, "frame": {"transform": torch.eye(4).tolist(), "scale": 1.0}},
+    )
 
 
 def python_verdict(path: Path) -> Verdict:
@@ -134,9 +129,7 @@ def python_verdict(path: Path) -> Verdict:
 @contextmanager
 def page_verdicts(folder: Path) -> Iterator[Callable[[Path], Verdict]]:
     """The verdicts of the page's decoder, by one process of Node."""
-    program = folder / "judge.mjs"
-    words = ["tests/judge.ts", "--bundle", "--platform=node", "--format=esm", "--log-level=error"]
-    subprocess.run([WEB / "node_modules/.bin/esbuild", *words, f"--outfile={program}"], cwd=WEB, check=True)
+    program = bundled("judge.ts", folder / "judge.mjs", "--platform=node")
     with subprocess.Popen(["node", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdin is not None
         assert process.stdout is not None
@@ -170,7 +163,7 @@ def run(count: int, seed: int = 0, keep: Path | None = None) -> tuple[Counter[st
     problems = []
     with TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        goods = scenes(folder)
+        goods = scenes()
         with page_verdicts(folder) as page_verdict:
             for i in range(seed, seed + count):
                 path = folder / "a.sundae"

@@ -13,9 +13,7 @@ one program, read again, and compared with the images of the full field in 32 vi
 from __future__ import annotations
 
 import argparse
-import csv
 import json
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,10 +22,10 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
-from bench_formats import read_rows, replace_rows
 from prune_without_photos import OTHER, decimated, device_of
 
 import sundae_ns as sn
+from harness.rows import Rows, read_rows
 from sundae_ns.plugin.distill import LEVELS, levels_of
 
 COLUMNS = ("field", "share", "tool", "gaussians", "psnr_to_field", "psnr_worst", "seconds", "device")
@@ -108,20 +106,12 @@ def main() -> None:
     if options.means is not None:
         print_means(options.means)
         return
-    rows = read_rows(options.out)
-    printed = csv.DictWriter(sys.stdout, COLUMNS, lineterminator="\n")
-    printed.writeheader()
+    rows = Rows(options.out, COLUMNS, ("field", "share", "tool"))
     for path in options.fields:
         for tool in options.tools:
-            if sum((row["field"], row["tool"]) == (path.stem, tool) for row in rows) == len(LEVELS):
-                continue
-            rows = [row for row in rows if (row["field"], row["tool"]) != (path.stem, tool)]
-            for row in rows_of(path, tool, options):
-                rows.append(row)
-                printed.writerow(row)
-                sys.stdout.flush()
-                if options.out is not None:
-                    replace_rows(options.out, rows, COLUMNS)
+            if not all({"field": path.stem, "share": share, "tool": tool} in rows for share in LEVELS):
+                for row in rows_of(path, tool, options):
+                    rows.put(row)
 
 
 if __name__ == "__main__":

@@ -21,14 +21,12 @@ from typing import Any
 
 import torch
 import torch.distributed as dist
-import tyro
-from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods
 from nerfstudio.scripts.train import _set_random_seed
 
+from harness.job import parse
 from harness.plan import parser_of
 from sundae_ns.io import checkpoint
 from sundae_ns.io.formats import read_gaussians
-from sundae_ns.train.schedules import set_schedule
 
 WARM = 100
 """Images before the clock starts on a tiled field: kernels load, and memory is allocated."""
@@ -87,10 +85,8 @@ def config_of(options: argparse.Namespace, extra: list[str], folder: Path, *, ti
     data = options.data.resolve()
     words = [options.method, "--data", str(data), "--output-dir", str(folder), "--vis", "tensorboard"]
     words += ["--max-num-iterations", str(options.tiled_steps if tiled else options.steps), *extra, *parser_of(data)]
-    config: Any = tyro.cli(AnnotatedBaseConfigUnion, args=words)
-    set_schedule(config, all_methods.get(options.method), words)
-    config.pipeline.datamanager.data, config.timestamp = data, "now"
-    config.experiment_name = "tiled" if tiled else "whole"
+    config: Any = parse(words)
+    config.experiment_name, config.timestamp = "tiled" if tiled else "whole", "now"
     config.steps_per_eval_image = config.steps_per_eval_all_images = config.steps_per_save = 10**9
     model = config.pipeline.model
     model.evaluate_prune = False

@@ -45,8 +45,6 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "sundae_ns"
 SECONDS = 120
 """A changed module counts as noticed if its tests take longer than this: they hang."""
-
-
 # Modules below the package, and tests that should notice a change in them; that named like the module runs first.
 ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "pruning": (("pruning/[!_]*.py",), ("pruning/test_*.py", "train/test_schedules.py")),
@@ -64,6 +62,7 @@ SWAPS = (
 OTHERS: dict[type[ast.AST], Any] = dict([*SWAPS, *(pair[::-1] for pair in SWAPS)])
 OTHERS |= {ast.FloorDiv: ast.Mult, ast.Mod: ast.Mult}
 """The operator in place of another."""
+STAYING = (ast.Raise, ast.JoinedStr, ast.Import, ast.ImportFrom)
 NAMES = {"min": "max", "max": "min", "any": "all", "all": "any", "floor": "ceil", "ceil": "floor"}
 
 
@@ -75,9 +74,7 @@ def walk(node: ast.AST) -> Iterator[ast.AST]:
         if name in ("annotation", "returns", "decorator_list") or (default and name == "value"):
             continue
         for child in value if isinstance(value, list) else [value]:
-            if isinstance(child, ast.AST) and not isinstance(
-                child, (ast.Raise, ast.JoinedStr, ast.Import, ast.ImportFrom)
-            ):
+            if isinstance(child, ast.AST) and not isinstance(child, STAYING):
                 child.parent = node  # type: ignore[attr-defined]
                 yield from walk(child)
 

@@ -55,9 +55,8 @@ def plot_curve() -> Any:
     packs = [row for row in lines_of("formats.csv") if row["format"] == ".sundae"]
     stock = {row["capture"]: row for row in packs if row["method"] == "splatfacto"}
     captures = list(dict.fromkeys(row["capture"] for row in rows))
-    figure, panels = plt.subplots(
-        2, len(captures), figsize=(3 * len(captures), 5.5), layout="constrained", sharex="col"
-    )
+    size = (3 * len(captures), 5.5)
+    figure, panels = plt.subplots(2, len(captures), figsize=size, layout="constrained", sharex="col")
     for column, capture in zip(panels.T, captures, strict=True):
         own = [row for row in rows if row["capture"] == capture]
         fixed = fixed_shares(own)
@@ -67,9 +66,8 @@ def plot_curve() -> Any:
             panel.plot(sizes, values, "-", color="tab:blue", label="fixed shares")
             for row, x, y in zip(fixed, sizes, values, strict=True):
                 panel.plot(x, y, "o", color="tab:blue", markerfacecolor="tab:blue" if row["head"] == "yes" else "white")
-                panel.annotate(
-                    f"{100 * float(row['share']):g}%", (x, y), (4, -10), textcoords="offset points", fontsize=7
-                )
+                share = f"{100 * float(row['share']):g}%"
+                panel.annotate(share, (x, y), (4, -10), textcoords="offset points", fontsize=7)
             for row in own:
                 if row["chosen"] == "yes":
                     place = int(row["packed_bytes"]) / MB, float(row[f"packed_{metric}"])

@@ -16,7 +16,6 @@ the .sundae file, ``bytes_sog`` of the base colours as .sog. With ``-o`` rows th
 from __future__ import annotations
 
 import argparse
-import csv
 import dataclasses
 import shlex
 import subprocess
@@ -28,18 +27,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from bench_formats import read_rows, replace_rows
 from torch import Tensor
 
 import sundae_ns as sn
+from harness.rows import Rows
 from sundae_ns.core.errors import SundaeError
 from sundae_ns.plugin.dataparsers import camera_of
 from sundae_ns.plugin.finished_runs import load_model
 
-COLUMNS = (
-    *("capture", "tool", "rule", "training", "share", "primitives", "bytes", "bytes_sog"),
-    *("psnr_to_field", "psnr", "ssim", "psnr_virtual", "seconds", "device", "seed", "steps"),
-)
+COLUMNS = """capture tool rule training share primitives bytes bytes_sog psnr_to_field psnr ssim psnr_virtual seconds
+device seed steps""".split()
 PLACE = ("capture", "tool", "rule", "training", "share", "device", "seed", "steps")
 """Columns that name a row."""
 OURS, OTHER = "sundae_ns", "splat-transform"
@@ -139,10 +136,6 @@ def row_of(full: Full, job: dict[str, Any], options: argparse.Namespace, folder:
     }
 
 
-def place(row: dict[str, Any]) -> tuple[str, ...]:
-    return tuple(str(row[name]) for name in PLACE)
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", type=Path, help="runs of full fields")
@@ -155,10 +148,7 @@ def main() -> int:
     parser.add_argument("--splat-transform", help="command of splat-transform, with options if it needs any")
     parser.add_argument("--again", action="store_true", help="measure rows that are there again")
     options = parser.parse_args()
-    rows = read_rows(options.out)
-    printed = csv.DictWriter(sys.stdout, COLUMNS, lineterminator="\n")
-    printed.writeheader()
-    failed = 0
+    rows, failed = Rows(options.out, COLUMNS, PLACE), 0
     for run in options.runs:
         try:
             full = full_field(run, options.data)
@@ -169,20 +159,13 @@ def main() -> int:
         known = {"capture": full.capture, "device": device_of(full.scene), "seed": options.seed}
         with tempfile.TemporaryDirectory() as folder:
             for job in jobs(options):
-                there = {place(row) for row in rows}
-                if place({**job, **known}) in there and not options.again:
+                if {**job, **known} in rows and not options.again:
                     continue
                 try:
-                    row = row_of(full, job, options, Path(folder))
+                    rows.put(row_of(full, job, options, Path(folder)))
                 except (SundaeError, OSError, subprocess.CalledProcessError) as error:
                     print(f"{full.capture}, {job}: {error}", file=sys.stderr)
                     failed = 1
-                    continue
-                printed.writerow(row)
-                sys.stdout.flush()
-                rows = [other for other in rows if place(other) != place(row)] + [row]
-                if options.out is not None:
-                    replace_rows(options.out, rows, COLUMNS)
     return failed
 
 

@@ -15,7 +15,7 @@ several whose results.jsonl are concatenated.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rich.console import Console
@@ -33,8 +33,6 @@ class QualityOptions(Options):
     script = "quality.py"
     keep_ratios: tuple[float, ...] = (0.01, 0.1)
     seeds: tuple[int, ...] = (42, 43, 44)
-    downscale: int = 1
-    """use the images of images_2, images_4 ... (COLMAP layout)."""
 
 
 def run_quality(options: QualityOptions, runner: Runner | None = None, console: Console | None = None) -> int:
@@ -42,16 +40,10 @@ def run_quality(options: QualityOptions, runner: Runner | None = None, console: 
     arms = choose_arms(options.arms, options.method, options.steps_scale)
     check_out(options.out, reads=[options.folder])
     data = options.folder.resolve()
-    plan = plan_scene(
-        data,
-        parser_of(data, options.downscale),
-        arms,
-        keep_ratios=options.keep_ratios,
-        seeds=options.seeds,
-        repeat_at=options.repeat_at,
-    )
+    shares = {"keep_ratios": options.keep_ratios, "repeat_at": options.repeat_at}
+    plan = plan_scene(data, parser_of(data, options.downscale), arms, seeds=options.seeds, **shares)
 
-    def page(results: Sequence[Result], failed: Mapping[str, str]) -> str:
+    def page(results: Sequence[Result], _: object) -> str:
         return quality_page(results, arms, options.command())
 
     return compare(plan, options, page, runner, console or Console())

@@ -27,7 +27,7 @@ from rich.markup import escape
 
 from harness.arms import choose_arms
 from harness.plan import Arm, Job, Words, jobs_of_shard, parser_of, plan_scene
-from harness.results import Result, group, mean_of, percent, quality_page, spread
+from harness.results import Groups, Result, group, mean_of, percent, quality_page, spread
 from harness.run import Options, Runner, check_out, compare, first_jobs, run_script
 from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.core.tables import MEGABYTE, number, table
@@ -52,12 +52,9 @@ PRINTED: Mapping[str, Mapping[float, tuple[float, float]]] = {
     "Deep Blending": {0.01: (26.57, 0.861), 0.1: (28.65, 0.892), 0.3: (29.40, 0.899), 0.5: (28.86, 0.900)},
 }
 """PSNR in dB and SSIM that the paper prints, by scene or data set and by keep ratio."""
-ARMS = (
-    *("splatfacto", "sundae", "sundae-with-head", "sundae-no-head", "sundae-no-head-bytes"),
-    *("band", "sundae-fast", "sundae-auto"),
+ARMS = tuple(
+    "splatfacto sundae sundae-with-head sundae-no-head sundae-no-head-bytes band sundae-fast sundae-auto".split()
 )
-
-
 PAPER_ARMS, PAPER_RATIOS = ("sundae", "sundae-no-head", "splatfacto"), (0.01, 0.1, 0.3, 0.5)
 
 
@@ -72,10 +69,8 @@ class SuiteOptions(Options):
     """shares of the Gaussians to keep; by default 0.1, with --paper 0.01, 0.1, 0.3 and 0.5."""
     scenes: tuple[str, ...] = ()
     """names of captures to measure; by default every folder in it."""
-    downscale: int = 1
-    """use the images of images_2, images_4 ... (COLMAP layout); with --paper those that papers use."""
     paper: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """measure the paper's scenes."""
+    """measure the paper's scenes, on the images of the sizes that papers use."""
 
 
 def run_suite(options: SuiteOptions, runner: Runner | None = None, console: Console | None = None) -> int:
@@ -95,7 +90,7 @@ def run_suite(options: SuiteOptions, runner: Runner | None = None, console: Cons
         make = paper_page if options.paper else suite_page
         return make(results, arms, {**left_out, **reasons}, options.command())
 
-    code = compare(plan, options, page, runner, console, whole_captures=not options.paper)
+    code = compare(plan, options, page, runner, console, whole=not options.paper)
     return code or int(bool(left_out) and not options.paper)
 
 
@@ -188,7 +183,7 @@ def paper_page(results: Sequence[Result], arms: Sequence[Arm], left_out: Mapping
     return "\n".join([*lines, "", quality_page(results, arms, command)])
 
 
-def _beside_printed(groups: Mapping[tuple[str, str, float | None], Sequence[Result]], place: int) -> list[str]:
+def _beside_printed(groups: Groups, place: int) -> list[str]:
     """Table of one metric, PSNR (place 0) or SSIM (1): our columns, then the paper's."""
     metric, digits = METRICS[place]
     columns = list(dict.fromkeys((arm, ratio) for _, arm, ratio in groups))
@@ -214,7 +209,7 @@ def _beside_printed(groups: Mapping[tuple[str, str, float | None], Sequence[Resu
     return table([*heads, *(f"*paper {share:.0%}*" for share in shares)], rows, words=1)
 
 
-def _packing(groups: Mapping[tuple[str, str, float | None], Sequence[Result]], name: str) -> list[str]:
+def _packing(groups: Groups, name: str) -> list[str]:
     rows = []
     for (scene, arm, ratio), own in groups.items():
         means = [result["measured"]["configurations"][0]["mean"] for result in own]

@@ -90,16 +90,6 @@ def _mean_of(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return {**mean, "keep_ratio": share}
 
 
-def first_of_each(rows: Sequence[Sequence[str]]) -> list[list[str]]:
-    """Rows whose first cell is left out where it repeats the one above."""
-    seen = ""
-    shown = []
-    for first, *others in rows:
-        shown.append([first if first != seen else "", *others])
-        seen = first
-    return shown
-
-
 def quality() -> list[str]:
     """All methods on the captures: quality and size; :func:`speed` has times, because suites share their GPUs."""
     found, cells = runs(), {}
@@ -192,14 +182,10 @@ def packed_headline() -> list[str]:
         return f"{number(size / MB, 1)}, {number(psnr, 1)}"
 
     stock = _stock(lambda row: cell(row["bytes"], row["psnr"]))
-    rows = [
-        [
-            capture,
-            *(stock.get(capture, {}).get(kind, "") for kind in FORMATS),
-            *(cell(_mean(found, f"{kind}_bytes"), _mean(found, f"{kind}_psnr")) for kind in ("packed", "tuned")),
-        ]
-        for capture, found in _defaults().items()
-    ]
+    rows = []
+    for capture, found in _defaults().items():
+        ours = (cell(_mean(found, f"{kind}_bytes"), _mean(found, f"{kind}_psnr")) for kind in ("packed", "tuned"))
+        rows.append([capture, *(stock.get(capture, {}).get(kind, "") for kind in FORMATS), *ours])
     kinds = list(FORMATS.values())
     return table(["capture", f"splatfacto, {kinds[0]}", *kinds[1:], "sundae", "fine-tuned"], rows, words=1)
 
@@ -257,40 +243,26 @@ def _least_bytes(packs: Sequence[dict[str, float]], metric: str, aim: float) -> 
 def multi_gpu() -> list[str]:
     """Training on one and several GPUs."""
     heads = ["field", "GPUs", "Gaussians", "images a second", "PSNR, dB", "MiB of a GPU, at most"]
-    rows = [
-        [
-            "tiled, not pruned" if "tiled" in line["variant"] else f"{line['scene']}, whole run",
-            f"{line['ranks']} {gpu(line['gpu']).split()[-1]}",
-            *(number(line["primitives"], 0), number(line["images_per_s"], 1)),
-            number(list(line["psnr_after_images"].values())[-1], 2),
-            number(max(line["peak_mib"]), 0),
-        ]
-        for line in sorted(lines_of("multi_gpu.jsonl"), key=lambda line: (line["variant"], line["ranks"]))
-    ]
-    return table(heads, first_of_each(rows))
+    rows, above = [], ""
+    for line in sorted(lines_of("multi_gpu.jsonl"), key=lambda line: (line["variant"], line["ranks"])):
+        field = "tiled, not pruned" if "tiled" in line["variant"] else f"{line['scene']}, whole run"
+        psnr = list(line["psnr_after_images"].values())[-1]
+        cells = [f"{line['ranks']} {line['gpu'].removesuffix(' 80GB HBM3').split()[-1]}"]
+        figures = ((line["primitives"], 0), (line["images_per_s"], 1), (psnr, 2), (max(line["peak_mib"]), 0))
+        rows.append([field if field != above else "", *cells, *(number(*figure) for figure in figures)])
+        above = field
+    return table(heads, rows)
 
 
 def trials() -> list[str]:
     """What held-out training views say of the head."""
     heads = ["capture", "training views", "held out", "without a head: dB", "SSIM", "with one: dB", "SSIM", "chosen"]
-    rows = [
-        [
-            *(line["capture"], line["training_views"], line["held_out"]),
-            *(
-                number(float(line[f"{name}_{arm}"]), digits)
-                for arm in ("plain", "head")
-                for name, digits in (("psnr", 2), ("ssim", 3))
-            ),
-            line["chosen"],
-        ]
-        for line in lines_of("trials.csv")
-    ]
+    rows = []
+    for line in lines_of("trials.csv"):
+        figures = ((f"psnr_{arm}", f"ssim_{arm}") for arm in ("plain", "head"))
+        cells = [number(float(line[name]), digits) for pair in figures for name, digits in zip(pair, (2, 3))]
+        rows.append([line["capture"], line["training_views"], line["held_out"], *cells, line["chosen"]])
     return table(heads, rows)
-
-
-def gpu(name: str) -> str:
-    """Name of a device as tables show it."""
-    return name.replace("NVIDIA ", "").replace(" 80GB HBM3", "")
 
 
 PRUNES = {
@@ -361,20 +333,8 @@ def _first(value: Any) -> str:
     return re.sub("`[^`]*`", lambda code: code[0].replace(" ", GLUE), sentence)  # a line must not begin with * or +
 
 
-MAKERS = (
-    quality,
-    speed,
-    training_time,
-    packing,
-    formats,
-    packed_headline,
-    equal_quality,
-    multi_gpu,
-    prune,
-    trials,
-    library,
-)
-TABLES: dict[str, Callable[[], list[str]]] = {make.__name__.replace("_", "-"): make for make in MAKERS}
+MAKERS = (quality, speed, training_time, packing, formats, packed_headline, equal_quality, multi_gpu, prune, trials)
+TABLES: dict[str, Callable[[], list[str]]] = {make.__name__.replace("_", "-"): make for make in (*MAKERS, library)}
 
 
 def with_tables(text: str) -> str:

@@ -7,14 +7,12 @@ Points are those that two of the training views see, or where there are no track
 
 import argparse
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
+from few_views import seen_twice, spread, triangulated
 from nerfstudio.data.utils import colmap_parsing_utils as colmap
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-from harness.few_views import seen_twice, spread, triangulated  # noqa: E402
 
 parser = argparse.ArgumentParser()
 parser.add_argument("capture", type=Path)

@@ -100,16 +100,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return next((number for number, first in enumerate(_FIRST) if name.is_relative_to(first)), len(_FIRST))
 
     items.sort(key=place)
-    if not ALL_SEEDS:
-        for item in items:
-            if item.get_closest_marker("long"):
-                item.add_marker(pytest.mark.skip(reason="takes a minute or more: make test-all"))
-    if torch.cuda.is_available():
-        return
-    skip = pytest.mark.skip(reason="no CUDA device here")
+    skips = {} if ALL_SEEDS else {"long": "takes a minute or more: make test-all"}
+    skips |= {} if torch.cuda.is_available() else {"gpu": "no CUDA device here"}
     for item in items:
-        if item.get_closest_marker("gpu"):  # not item.keywords, which has the folder tests/gpu too
-            item.add_marker(skip)
+        for mark, reason in skips.items():
+            if item.get_closest_marker(mark):  # not item.keywords, which has folders of that name too
+                item.add_marker(pytest.mark.skip(reason=reason))
 
 
 @pytest.fixture(autouse=True)

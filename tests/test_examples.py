@@ -34,12 +34,10 @@ def run(short_prunes, monkeypatch, capsys):  # noqa: F811
 @pytest.fixture(scope="module")
 def cloud(tmp_path_factory):
     """A ball of smooth colours."""
-    generator = torch.Generator().manual_seed(0)
-    points = torch.nn.functional.normalize(torch.randn(600, 3, generator=generator), dim=1)
+    points = torch.nn.functional.normalize(torch.randn(600, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     scene = sn.Scene.from_points(points, 0.5 + 0.4 * points)
     scene.gaussians["opacities"] += 4
-    path = tmp_path_factory.mktemp("examples") / "cloud.ply"
-    sn.save(scene, path)
+    sn.save(scene, path := tmp_path_factory.mktemp("examples") / "cloud.ply")
     return path
 
 

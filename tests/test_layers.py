@@ -48,6 +48,12 @@ def modules():
     return names
 
 
+@cache
+def imports():
+    """What each module of the package imports."""
+    return {name: set(imports_of(path.read_text())) for name, path in modules().items()}
+
+
 def room_of(module):
     """The room of a module of the package; None for other modules and for the package itself."""
     parts = module.split(".")
@@ -74,17 +80,16 @@ def violations(room, imported):
 
 def circles(edges):
     """Modules on a circle of imports."""
-    on_circle = []
-    for start in edges:
-        reached = set()
-        waiting = [start]
+
+    def reached(start):
+        found, waiting = set(), [start]
         while waiting:
-            for target in edges.get(waiting.pop(), set()) - reached:
-                reached.add(target)
-                waiting.append(target)
-        if start in reached:
-            on_circle.append(start)
-    return on_circle
+            new = set(edges.get(waiting.pop(), ())) - found
+            found |= new
+            waiting += new
+        return found
+
+    return [start for start in edges if start in reached(start)]
 
 
 def lines_of_rooms():
@@ -125,26 +130,20 @@ def test_file_names_are_told_apart():
 
 
 def test_rooms_import_only_lower_floors():
-    wrong = {}
-    for module, path in modules().items():
-        room = room_of(module)
-        if room is not None and (rooms := violations(room, imports_of(path.read_text()))):
-            wrong[module] = rooms
-    assert not wrong
+    assert not {
+        module: rooms
+        for module, names in imports().items()
+        if (room := room_of(module)) is not None and (rooms := violations(room, names))
+    }
 
 
 def test_no_module_is_on_a_circle():
-    assert not circles({name: set(imports_of(path.read_text())) for name, path in modules().items()})
+    assert not circles(imports())
 
 
 def test_only_the_plugin_imports_nerfstudio():
-    allowed = ("plugin", "method_configs")
-    assert not [
-        module
-        for module, path in modules().items()
-        if room_of(module) not in allowed
-        and any(name.split(".")[0] == "nerfstudio" for name in imports_of(path.read_text()))
-    ]
+    below = {name: names for name, names in imports().items() if room_of(name) not in ("plugin", "method_configs")}
+    assert not [name for name, names in below.items() if any(each.split(".")[0] == "nerfstudio" for each in names)]
 
 
 def test_the_lower_rooms_do_not_load_it():

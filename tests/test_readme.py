@@ -59,8 +59,6 @@ def test_scripts_and_targets_exist():
     assert [target for target in targets if not re.search(rf"^{target}:", makefile, re.MULTILINE)] == []
 
 
-# ------------------------------------------------------------------------------------------------------- docs/method.md
-
 METHOD = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
 NAME = re.compile(r"`(sundae_ns(?:\.\w+)+)`")
 EQUATION = re.compile(r"```math\n(.*?)```\n", re.DOTALL)

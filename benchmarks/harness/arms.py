@@ -6,6 +6,7 @@ import contextlib
 import difflib
 import io
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -103,11 +104,9 @@ def _read_options(given: Any, where: str) -> dict[str, Words]:
 
 
 def _refuse_duplicates(names: Iterable[str], where: str) -> None:
-    seen: set[str] = set()
-    for name in names:
-        if name in seen:
+    for name, count in Counter(names).items():
+        if count > 1:
             raise ConfigError(f"{where} has {name} twice; give each once")
-        seen.add(name)
 
 
 def _checked(entry: Entry, default: str, scale: float, from_scratch: bool) -> Arm:

@@ -19,7 +19,6 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any, NamedTuple, TypeVar
 
 import msgspec
@@ -91,9 +90,7 @@ class Browser:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stack.close()
 
     def _start(self) -> None:
@@ -113,9 +110,8 @@ class Browser:
 
         def ready() -> bool:
             if process.poll() is not None:
-                raise BrowserError(
-                    f"the browser ended with {process.returncode}: {(profile / 'log').read_text()[-500:]}"
-                )
+                end = (profile / "log").read_text()[-500:]
+                raise BrowserError(f"the browser ended with {process.returncode}: {end}")
             return address.exists() and address.read_text().count("\n") == 1
 
         wait_for(ready, "the browser's port", 60)
@@ -159,13 +155,7 @@ class Browser:
             raise BrowserError(f"{method}: {message['error'].get('message')}")
         return dict(message["result"])
 
-    def _send(
-        self,
-        method: str,
-        params: dict[str, Any] | None,
-        session: str | None,
-        answer: queue.SimpleQueue[dict[str, Any]] | None = None,
-    ) -> int:
+    def _send(self, method: str, params: dict[str, Any] | None, session: str | None, answer: Any = None) -> int:
         with self._lock:
             self._calls += 1
             number = self._calls
@@ -215,9 +205,8 @@ class Browser:
     def _on_message(self, part: dict[str, Any]) -> None:
         """Note what viser's page and server tell each other."""
         if part.get("type") == "ViewerCameraMessage":
-            self.camera = Camera(
-                tuple(part["wxyz"]), tuple(part["position"]), float(part["fov"]), float(part["aspect"])
-            )
+            place = tuple(part["wxyz"]), tuple(part["position"])
+            self.camera = Camera(*place, float(part["fov"]), float(part["aspect"]))
         elif part.get("type") == "BackgroundImageMessage":
             with Image.open(io.BytesIO(part["rgb_bytes"])) as image:
                 self.images.append(image.size)

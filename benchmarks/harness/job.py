@@ -13,14 +13,17 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from copy import deepcopy
 from dataclasses import asdict, replace
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
+from unittest import mock
 
 import torch
 import tyro
+from filelock import FileLock
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.scripts.train import _set_random_seed
@@ -61,21 +64,10 @@ def perform(job: Job, out: Path) -> None:
     """Do a job unless it is done; wait for another process that does the same job."""
     job_folder(out, job.key).mkdir(parents=True, exist_ok=True)
     done_file(out, job.key).parent.mkdir(parents=True, exist_ok=True)
-    with _locked(job_folder(out, job.key) / "lock"):
+    with FileLock(job_folder(out, job.key) / "lock"):
         if not done_file(out, job.key).exists():
             result = train_and_measure(job, out)
             write_text(done_file(out, job.key), json.dumps(result) + "\n")
-
-
-@contextlib.contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    """Hold a file's lock, which the system releases when the process ends; no lock on Windows."""
-    with path.open("a") as file:
-        if os.name == "posix":
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX)
-        yield
 
 
 @contextlib.contextmanager
@@ -119,9 +111,8 @@ def train_and_measure(job: Job, out: Path) -> dict[str, Any]:
         opened, measured = _measured(job, config, command)
         small = ours and job.kind != "warm-up"
         packed = pack(opened, job_folder(out, job.key) / "scene.sundae") if small else None
-        tuned = (
-            tune(opened, job_folder(out, job.key) / "tuned.sundae") if packed and torch.cuda.is_available() else None
-        )
+        fine = packed and torch.cuda.is_available()
+        tuned = tune(opened, job_folder(out, job.key) / "tuned.sundae") if fine else None
         had_gpu = alone()
     measured = measured if had_gpu else without_times(measured)
     described = {"job": asdict(job), "measured": measured.as_json()}
@@ -245,24 +236,10 @@ def _run_folder(out: Path, key: str | None) -> Path:
     return job_folder(out, str(key)) / result["job"]["arm"] / result["job"]["method"] / "run"
 
 
-class _Nothing(torch.nn.Module):
-    """Replaces LPIPS in stock splatfacto, whose constructor would download its weights."""
-
-    def __init__(self, **_: Any) -> None:
-        super().__init__()
-
-
-@contextlib.contextmanager
-def without_lpips() -> Iterator[None]:
-    """Keep stock splatfacto from building LPIPS; training evaluates nothing."""
-    import torchmetrics.image.lpip as module
-
-    real = module.LearnedPerceptualImagePatchSimilarity
-    module.LearnedPerceptualImagePatchSimilarity = _Nothing  # type: ignore[misc,assignment]
-    try:
-        yield
-    finally:
-        module.LearnedPerceptualImagePatchSimilarity = real  # type: ignore[misc]
+def without_lpips() -> AbstractContextManager[Any]:
+    """Keep stock splatfacto from building LPIPS, whose weights it would download; training evaluates nothing."""
+    name = "torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity"
+    return mock.patch(name, return_value=torch.nn.Module())
 
 
 def _forget() -> None:

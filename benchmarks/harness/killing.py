@@ -134,9 +134,8 @@ class Bench:
         self.context: Any = multiprocessing.get_context("spawn" if device == "cuda" else "forkserver")
         if device == "cpu":
             # Fork from a process without threads: a child could wait for their locks for ever.
-            self.context.set_forkserver_preload(
-                ["nerfstudio.scripts.train", "sundae_ns.plugin.model", "sundae_ns.plugin.trainer"]
-            )
+            loaded = ["nerfstudio.scripts.train", "sundae_ns.plugin.model", "sundae_ns.plugin.trainer"]
+            self.context.set_forkserver_preload(loaded)
 
     def start(self, work: Any, what: Any, *arguments: Any) -> BaseProcess:
         """Start a process that calls ``work`` with the log."""

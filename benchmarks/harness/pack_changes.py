@@ -35,17 +35,6 @@ class Pack:
             at += size
         return cls(meta, bodies)
 
-    def copy(self) -> Pack:
-        return Pack(json.loads(json.dumps(self.meta)), list(self.bodies))
-
-    def sealed(self) -> None:
-        """State the checksums of the sections."""
-        for section, body in zip(self.meta["sections"], self.bodies, strict=True):
-            section["sha256"] = hashlib.sha256(body).hexdigest()
-
-    def text(self) -> bytes:
-        return json.dumps(self.meta).encode()
-
 
 def with_header(text: bytes, bodies: Iterable[bytes]) -> bytes:
     """A file of a header and sections, with a valid checksum of the header."""
@@ -183,12 +172,13 @@ CHANGES: tuple[Callable[[Pack, random.Random], None], ...] = (
 def mutated(good: Pack, seed: int) -> bytes:
     """A file that differs from a good one by one or two changes; the seed chooses them."""
     rng = random.Random(seed)
-    pack = good.copy()
+    pack = Pack(json.loads(json.dumps(good.meta)), list(good.bodies))
     for change in rng.choices(CHANGES, k=rng.choice((1, 1, 1, 2))):
         # The change before may have left nothing to change.
         with suppress(ArithmeticError, AttributeError, LookupError, TypeError, ValueError, SundaeError, zlib.error):
             change(pack, rng)
     with suppress(AttributeError, TypeError, ValueError):  # the list of sections may be none
-        pack.sealed()
-    text = pack.text().replace(f'"{RAW}"'.encode(), rng.choice(TEXTS).encode())
+        for section, body in zip(pack.meta["sections"], pack.bodies, strict=True):
+            section["sha256"] = hashlib.sha256(body).hexdigest()
+    text = json.dumps(pack.meta).encode().replace(f'"{RAW}"'.encode(), rng.choice(TEXTS).encode())
     return with_header(text, pack.bodies)

@@ -15,6 +15,7 @@ Kind = Literal["branch", "whole"]
 
 Words: TypeAlias = tuple[str, ...]
 """Words of a command line."""
+Shares: TypeAlias = Sequence[float]
 
 WARM_UP = "warm-up"
 
@@ -73,13 +74,7 @@ def parser_of(data: Path, downscale: int = 1) -> Words:
 
 
 def plan_scene(
-    data: Path,
-    parser: Words,
-    arms: Sequence[Arm],
-    *,
-    keep_ratios: Sequence[float],
-    seeds: Sequence[int],
-    repeat_at: Sequence[float],
+    data: Path, parser: Words, arms: Sequence[Arm], *, keep_ratios: Shares, seeds: Sequence[int], repeat_at: Shares
 ) -> list[Job]:
     """All jobs on one capture, warm-ups before the jobs that need them; ``ConfigError`` for a wrong ratio or seed.
 
@@ -154,9 +149,7 @@ def _command(options: Mapping[str, Words]) -> Words:
     return tuple(word for name, words in options.items() for word in (f"--{name}", *words))
 
 
-def _check(
-    keep_ratios: Sequence[float], seeds: Sequence[int], repeat_at: Sequence[float], own: Sequence[float]
-) -> None:
+def _check(keep_ratios: Shares, seeds: Sequence[int], repeat_at: Shares, own: Shares) -> None:
     wrong = [ratio for ratio in keep_ratios if not 0 < ratio <= 1]
     if wrong:
         raise ConfigError(f"keep ratio {wrong[0]} cannot be; give shares in (0, 1], 0.1 for a tenth")

@@ -6,7 +6,7 @@ import json
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from harness.plan import Arm
 from sundae_ns.core.errors import DataError
@@ -16,6 +16,7 @@ from sundae_ns.report.measure import METRICS, csv_text
 
 Result = Mapping[str, Any]
 """Content of a file in ``done/``: the job's description as ``job``, its figures as ``measured``."""
+Groups: TypeAlias = dict[tuple[str, str, float | None], list[Result]]
 
 
 def read_results(out: Path) -> list[Result]:
@@ -39,9 +40,9 @@ def write_results(out: Path, results: Sequence[Result], page: str) -> None:
     write_text(out / "table.md", page)
 
 
-def group(results: Sequence[Result], arms: Sequence[Arm]) -> dict[tuple[str, str, float | None], list[Result]]:
+def group(results: Sequence[Result], arms: Sequence[Arm]) -> Groups:
     """Results by scene, arm and share, in their order; warm-ups first."""
-    groups: dict[tuple[str, str, float | None], list[Result]] = {}
+    groups: Groups = {}
     for result in results:
         job = result["job"]
         groups.setdefault((job["scene"], job["arm"], job["keep_ratio"]), []).append(result)
@@ -49,9 +50,7 @@ def group(results: Sequence[Result], arms: Sequence[Arm]) -> dict[tuple[str, str
     return dict(sorted(groups.items(), key=lambda item: (item[0][0], item[0][2] or -1.0, order.get(item[0][1], -1))))
 
 
-def _alike(
-    groups: Mapping[tuple[str, str, float | None], list[Result]],
-) -> Iterator[tuple[str, float | None, list[Result]]]:
+def _alike(groups: Groups) -> Iterator[tuple[str, float | None, list[Result]]]:
     """Arm, share and results of each group, apart by whether a head came out: trials may differ between seeds."""
     for (_, arm, ratio), own in groups.items():
         for count in sorted({len(r["measured"]["configurations"]) for r in own}, reverse=True):

@@ -8,19 +8,18 @@ import shlex
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, NoReturn
 
 import tyro
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import MofNCompleteColumn, Progress, TaskID, TimeElapsedColumn
+from rich.progress import track
 
 from harness.plan import Job, done_file, job_folder, jobs_of_shard
 from harness.results import Result, read_results, write_results
 from sundae_ns.cli.main import exit_with
-from sundae_ns.cli.process import percent_of, run_logged
+from sundae_ns.cli.process import run_logged
 from sundae_ns.cli.refusals import check_folder
 from sundae_ns.core.errors import ConfigError, StorageError, SundaeError, writing
 from sundae_ns.core.files import write_text
@@ -33,8 +32,7 @@ START_JOB = "import sys; sys.path[0] = sys.argv.pop(1); from harness.job import 
 ERROR = "sundae: "
 """Start of the line in which a command reports an error of the package."""
 
-OnPercent = Callable[[float], object]
-Runner = Callable[[Job, Path, OnPercent], None]
+Runner = Callable[[Job, Path], None]
 """Runs one job, which writes its result to ``done/``."""
 Page = Callable[[Sequence[Result], Mapping[str, str]], str]
 """Makes the page of all results, and of the reasons of failed jobs by key."""
@@ -60,6 +58,8 @@ class Options:
     """shares that run with all seeds."""
     method: str = "sundae"
     """method of arms that name none; one of this package that prunes once."""
+    downscale: int = 1
+    """use the images of images_2, images_4 ... (COLMAP layout)."""
     steps_scale: float = 1.0
     """factor on all lengths, for a trial."""
     shard: str = "1/1"
@@ -90,21 +90,18 @@ def check_out(out: Path, *, reads: Iterable[Path]) -> None:
 
 
 def compare(
-    plan: Sequence[Job],
-    options: Options,
-    page: Page,
-    runner: Runner | None,
-    console: Console,
-    *,
-    whole_captures: bool = False,
+    plan: Sequence[Job], options: Options, page: Page, runner: Runner | None, console: Console, *, whole: bool = False
 ) -> int:
-    """List the jobs, or run them and write the tables; the exit code, 1 if a job failed."""
+    """List the jobs, or run them and write the tables; the exit code, 1 if a job failed.
+
+    ``whole`` captures are left out once their first job has failed.
+    """
     out, jobs = options.out, jobs_of_shard(plan, options.shard)
     if options.jobs:
         show_jobs(jobs, out, console)
         return 0
     try:
-        failed = run_jobs(jobs, out, runner or spawn, console, whole_captures=whole_captures)
+        failed = run_jobs(jobs, out, runner or spawn, console, whole=whole)
     except KeyboardInterrupt:
         console.print("stopped; the same command resumes", highlight=False)
         return STOPPED
@@ -127,7 +124,7 @@ def show_jobs(jobs: Sequence[Job], out: Path, console: Console) -> None:
 
 
 def run_jobs(
-    jobs: Sequence[Job], out: Path, runner: Runner, console: Console, *, whole_captures: bool = False
+    jobs: Sequence[Job], out: Path, runner: Runner, console: Console, *, whole: bool = False
 ) -> dict[str, str]:
     """Run the jobs that are not done, one at a time; a job that fails stops only the jobs that need it.
 
@@ -140,32 +137,23 @@ def run_jobs(
     # Results may lie here without their runs, and a branch needs the run of its warm-up.
     needed = {job.needs for job in jobs if job.key not in done}
     done = {key: result for key, result in done.items() if key not in needed or done_file(out, key).exists()}
-    first = first_jobs(jobs) if whole_captures else {}
+    first = first_jobs(jobs) if whole else {}
     failed: dict[str, str] = {}
-    columns = (*Progress.get_default_columns()[:-1], MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
-        everything = progress.add_task("Jobs", total=len(jobs))
-        for job in jobs:
-            if job.key not in done and first.get(job.scene) not in failed:
-                task = progress.add_task(escape(job.key), total=100)
-                try:
-                    if job.needs in failed:
-                        raise SundaeError(f"its warm-up has failed: {job.needs}")
-                    _describe(job, out)
-                    runner(job, out, partial(_show, progress, task))
-                except SundaeError as error:
-                    failed[job.key] = str(error)
-                    text = f"[red]{escape(job.key)} failed:[/red] {escape(str(error))}"
-                    console.print(text, highlight=False, soft_wrap=True)
-                    if first.get(job.scene) == job.key:
-                        console.print(f"[yellow]Left out: {escape(job.scene)}", highlight=False)
-                progress.remove_task(task)
-            progress.advance(everything)
+    for job in track(jobs, "Jobs", console=console, transient=True):
+        if job.key in done or first.get(job.scene) in failed:
+            continue
+        try:
+            if job.needs in failed:
+                raise SundaeError(f"its warm-up has failed: {job.needs}")
+            _describe(job, out)
+            runner(job, out)
+        except SundaeError as error:
+            failed[job.key] = str(error)
+            text = f"[red]{escape(job.key)} failed:[/red] {escape(str(error))}"
+            console.print(text, highlight=False, soft_wrap=True)
+            if first.get(job.scene) == job.key:
+                console.print(f"[yellow]Left out: {escape(job.scene)}", highlight=False)
     return failed
-
-
-def _show(progress: Progress, task: TaskID, percent: float) -> None:
-    progress.update(task, completed=percent)
 
 
 def first_jobs(jobs: Sequence[Job]) -> dict[str, str]:
@@ -173,18 +161,12 @@ def first_jobs(jobs: Sequence[Job]) -> dict[str, str]:
     return {job.scene: job.key for job in reversed(jobs)}
 
 
-def spawn(job: Job, out: Path, on_percent: OnPercent) -> None:
+def spawn(job: Job, out: Path) -> None:
     """Run a job in a process of its own: memory, crashes and random numbers stay apart."""
-
-    def on_line(line: str) -> None:
-        percent = percent_of(line)
-        if percent is not None:
-            on_percent(percent)
-
     # Another shard may wait for the same warm-up.
     log = job_folder(out, job.key) / f"log-{os.getpid()}.txt"
     words = [sys.executable, "-c", START_JOB, str(Path(__file__).parents[1]), str(out), job.key]
-    code, end = run_logged(words, log, on_line)
+    code, end = run_logged(words, log)
     if code == 130:
         raise KeyboardInterrupt
     if code:

@@ -82,9 +82,8 @@ class ViewerPage(Browser):
         self._unfold(name)
         x, y, _, _ = self._place(f"{OPTIONS}.find(e => e.innerText.trim() === {json.dumps(option)})", f"{option!r}")
         self.click(x, y)
-        wait_for(
-            lambda: self._script(f"control({json.dumps(name)}).value") == option, f"{name!r} to be {option!r}", SLOW
-        )
+        value = f"control({json.dumps(name)}).value"
+        wait_for(lambda: self._script(value) == option, f"{name!r} to be {option!r}", SLOW)
 
     def tick(self, name: str, on: bool) -> None:
         """Switch a check box."""
@@ -104,11 +103,9 @@ class ViewerPage(Browser):
 
     def canvas(self) -> tuple[int, int, int, int]:
         """Left, top, width and height of the scene in a screenshot."""
-        found = self.evaluate(
-            "(() => { const r = document.querySelector('canvas').parentElement.getBoundingClientRect();"
-            " return [r.x, r.y, r.width, r.height].map(Math.round); })()"
-        )
-        left, top, width, height = found
+        box = "[r.x, r.y, r.width, r.height].map(Math.round)"
+        canvas = "document.querySelector('canvas').parentElement.getBoundingClientRect()"
+        left, top, width, height = self.evaluate(f"(r => {box})({canvas})")
         return left, top, width, height
 
     def settle(self, act: Callable[[], Any] | None = None, longest: int = 512) -> Any:
@@ -171,10 +168,10 @@ class Server:
         name, *rest = map(str, command)
         words = [str(Path(sys.executable).parent / name), *rest]
         words += ["--viewer.websocket-host", "127.0.0.1", "--viewer.websocket-port", str(self._port)]
+        environment = {**os.environ, "COLUMNS": "160"}
         with log.open("w") as file:
-            self.process = subprocess.Popen(
-                words, stdout=file, stderr=file, stdin=subprocess.DEVNULL, env={**os.environ, "COLUMNS": "160"}
-            )
+            streams: dict[str, Any] = {"stdout": file, "stderr": file, "stdin": subprocess.DEVNULL}
+            self.process = subprocess.Popen(words, **streams, env=environment)
 
     def output(self) -> str:
         """Its output so far."""

@@ -5,16 +5,29 @@ import os
 import sys
 import urllib.request
 from contextlib import redirect_stdout
+from copy import deepcopy
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+import torch
 import yaml
+from nerfstudio.configs.method_configs import all_methods
 from short_prunes import short_distillation, short_prunes  # noqa: F401
 from trial_runs import set_options, tidy
 
 from harness.still_life import write_still_life
+from sundae_ns.core.gaussians import sh_degree
+from sundae_ns.io import checkpoint
+
+SHORT = """
+--experiment-name tiny --timestamp now --vis tensorboard --viewer.quit-on-train-completion True
+--save-only-latest-checkpoint False --steps-per-eval-image 50 --logging.steps-per-log 5
+--pipeline.model.warmup-length 20 --pipeline.model.refine-every 15 --pipeline.model.densify-grad-thresh 0.0004
+--pipeline.model.sh-degree-interval 20
+"""
+"""Options of the tiny run: one round of densification, at step 30."""
 
 
 class TinyRun(NamedTuple):
@@ -79,27 +92,10 @@ def tiny(call_here, once):
 
     def train(root):
         scene = write_still_life(root / "scene", train_views=12, test_views=3, width=48, height=48, points=known.points)
-        options = {
-            "data": scene,
-            "output-dir": root / "outputs",
-            "experiment-name": "tiny",
-            "timestamp": "now",
-            "max-num-iterations": known.steps,
-            "steps-per-save": known.save_every,
-            "save-only-latest-checkpoint": False,
-            "steps-per-eval-image": 50,
-            "vis": "tensorboard",
-            "viewer.quit-on-train-completion": True,
-            "logging.steps-per-log": 5,
-            "pipeline.model.pruning.prune-at": known.prune_at,
-            "pipeline.model.pruning.keep-ratio": known.keep_ratio,
-            # One round of densification, at step 30.
-            "pipeline.model.warmup-length": 20,
-            "pipeline.model.refine-every": 15,
-            "pipeline.model.densify-grad-thresh": 0.0004,
-            "pipeline.model.sh-degree-interval": 20,
-        }
-        words = [word for name, value in options.items() for word in (f"--{name}", value)]
+        options = {"data": scene, "output-dir": root / "outputs", "max-num-iterations": known.steps}
+        options |= {"steps-per-save": known.save_every, "pipeline.model.pruning.prune-at": known.prune_at}
+        options |= {"pipeline.model.pruning.keep-ratio": known.keep_ratio}
+        words = [word for name, value in options.items() for word in (f"--{name}", value)] + SHORT.split()
         (root / "output.txt").write_text(call_here("ns-train", "sundae-tiny", *words))
         tidy()
 
@@ -109,13 +105,20 @@ def tiny(call_here, once):
 
 
 @pytest.fixture(scope="session")
-def exported(tiny, call_here, open3d, once):
-    """The .ply that ns-export writes of the tiny run; skips where open3d does not import."""
+def stock_run(tiny):
+    """Write a run of splatfacto as nerfstudio does, with Gaussians that are given: it cannot train without CUDA."""
 
-    def export(folder):
-        call_here("ns-export", "gaussian-splat", "--load-config", tiny.config, "--output-dir", folder)
+    def write(folder, gaussians, step):
+        config = deepcopy(all_methods["splatfacto"])
+        config.data = config.pipeline.datamanager.data = tiny.scene
+        config.pipeline.model.sh_degree = sh_degree(gaussians["features_rest"])
+        state = {f"_model.gauss_params.{name}": value for name, value in gaussians.items() if name != "features"}
+        state["_model.device_indicator_param"] = torch.zeros(0)
+        checkpoint.write({"step": step, "pipeline": state}, folder / "nerfstudio_models" / f"step-{step:09d}.ckpt")
+        (folder / "config.yml").write_text(yaml.dump(config))
+        return folder
 
-    return once("exported", export) / "splat.ply"
+    return write
 
 
 @pytest.fixture(autouse=True)

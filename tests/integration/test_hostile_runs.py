@@ -11,12 +11,7 @@ import yaml
 from sundae_ns.cli import main
 from sundae_ns.cli.main import COMMANDS
 
-CONFIGS = {
-    "nothing else": lambda text: "!!python/object/apply:os.system ['touch PWNED']\n",
-    "among options": lambda text: text.replace(
-        "\nload_step: null\n", "\nload_step: !!python/object/new:os.system ['touch PWNED']\n"
-    ),
-}
+HOSTILE = "!!python/object/new:os.system ['touch PWNED']\n"
 WORDS = {
     "run": ["CAPTURE", "-o", "PROJECT", "--method", "sundae-tiny"],
     "poses": ["RUN", "-o", "capture"],
@@ -34,13 +29,13 @@ WORDS = {
 """Words of each command on a run, or on a folder with one."""
 
 
-@pytest.fixture(params=CONFIGS)
-def hostile(request, tiny, tmp_path, monkeypatch):
+@pytest.fixture
+def hostile(tiny, tmp_path, monkeypatch):
     """A hostile run: alone, in a project of ``sundae run``, and in a folder of ``sundae demo``."""
     monkeypatch.chdir(tmp_path)
     shutil.copytree(tiny.scene, "CAPTURE")
-    config = CONFIGS[request.param](tiny.config.read_text())
-    assert "os.system" in config
+    config = tiny.config.read_text().replace("\nload_step: null\n", f"\nload_step: {HOSTILE}")
+    assert HOSTILE in config
     for folder in ("RUN", "PROJECT/runs/CAPTURE/sundae-tiny/run", "DEMO/runs/demo/sundae-tiny/run"):
         shutil.copytree(tiny.folder, folder)
         Path(folder, "config.yml").write_text(config)
@@ -50,10 +45,9 @@ def hostile(request, tiny, tmp_path, monkeypatch):
     assert not list(tmp_path.rglob("PWNED"))
 
 
-@pytest.mark.parametrize("kind", CONFIGS)
-def test_nerfstudio_would_run_it(kind, tmp_path, monkeypatch):
+def test_nerfstudio_would_run_it(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    yaml.load(CONFIGS[kind]("a: 1\nload_step: null\n"), Loader=yaml.Loader)
+    yaml.load(f"a: 1\nload_step: {HOSTILE}", Loader=yaml.Loader)
     assert Path("PWNED").exists()
 
 
@@ -78,9 +72,8 @@ def test_no_command_runs_it(command, monkeypatch):
     def stop(server):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sundae_ns.cli.run.run_command", start)
-    monkeypatch.setattr("sundae_ns.cli.demo.run_command", start)
-    monkeypatch.setattr("sundae_ns.cli.train.run_command", start)
+    for module in ("run", "demo", "train"):
+        monkeypatch.setattr(f"sundae_ns.cli.{module}.run_command", start)
     monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", stop)
     with pytest.raises(SystemExit):
         main([command, *WORDS[command]])

@@ -1,29 +1,23 @@
 """``sundae pack`` on a finished run: what it says and stores, targets of bytes or quality, and the fine-tune."""
 
-import copy
-import hashlib
 import json
 import re
 import shutil
 from statistics import fmean
 from types import SimpleNamespace
-from typing import NamedTuple
 
 import pytest
 import torch
-import yaml
 from command_line import run
-from nerfstudio.configs.method_configs import all_methods
+from kill_and_resume import contents
 
 from sundae_ns.cli.pack import PackDetails, pack
 from sundae_ns.core.errors import CheckpointError, ConfigError, MemoryExhaustedError, PackError
 from sundae_ns.core.metrics import Quality, psnr
-from sundae_ns.io import checkpoint
 from sundae_ns.io.formats import read_gaussians
-from sundae_ns.io.pack.codecs import Codecs
-from sundae_ns.io.pack.config import FINETUNED, PackConfig
+from sundae_ns.io.pack.config import FINETUNED, STEPS, PackConfig
 from sundae_ns.io.pack.container import read_header
-from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes, read_scene, write_fitted
+from sundae_ns.io.pack.packed_scene import fit_scene, pack_bytes, read_scene, write_fitted
 from sundae_ns.io.pack.quantize import Transform
 from sundae_ns.plugin import tuned_packs
 from sundae_ns.plugin.finished_runs import load_model, load_run
@@ -75,31 +69,29 @@ def test_the_table_counts_every_byte(tiny, tmp_path, capsys):
     assert {"means", "quats", "scales", "features", "head", "cameras", "header"} <= set(rows)
 
 
-def test_the_up_axis_is_that_of_the_capture(packed):
+def test_a_packed_run_is_read(packed):
     """nerfstudio turns a capture until the mean of its cameras' upward directions is z."""
-    found = load(packed)
+    found, (params, in_model_frame) = load(packed), read_gaussians(packed)
     assert found.up == (0, 0, 1)
     ups = torch.stack([camera.pose[:, 1] for camera in found.cameras]).mean(dim=0)
     assert torch.nn.functional.cosine_similarity(ups, torch.tensor(found.up), dim=0) > 0.99
+    assert in_model_frame
+    assert "features" not in params
+    assert all(torch.equal(value, found.gaussians[name]) for name, value in params.items())
 
 
-@pytest.mark.parametrize("option", ["--crop", "--remove-floaters"])
-def test_a_run_is_cut_before_it_is_packed_or_exported(tiny, packed, tmp_path, capsys, option):
+def test_a_run_is_cut_before_it_is_packed_or_exported(tiny, packed, tmp_path, capsys):
     whole, places = load(packed), load(tiny.folder).gaussians["means"][:, 0]
     middle = float(places.median())
-    words = [option, *([-1e3, -1e3, -1e3, middle, 1e3, 1e3] if option == "--crop" else [])]
+    words = ["--crop", -1e3, -1e3, -1e3, middle, 1e3, 1e3, "--remove-floaters"]
     assert run("pack", tiny.folder, "-o", tmp_path / "a.sundae", *words) == 0
-    found, said = load(tmp_path / "a.sundae"), capsys.readouterr()
+    found = load(tmp_path / "a.sundae")
     assert (found.head is None) == (whole.head is None)
     assert (found.meta["capture"], found.up) == (whole.meta["capture"], whole.up)
-    if option == "--crop":
-        assert float(found.gaussians["means"][:, 0].max()) < middle + 0.01
-        assert found.num_gaussians == int((places <= middle).sum())
-        assert "PSNR" not in said.out, "the photos show what is cut"
-    else:
-        before, after = map(float, re.findall(r"PSNR ([\d.]+) -> ([\d.]+) dB", said.out)[0])
-        assert after > before - 0.15
-        assert found.num_gaussians <= whole.num_gaussians
+    assert float(found.gaussians["means"][:, 0].max()) < middle + 0.01
+    inside = int((places <= middle).sum())
+    assert 0.8 * inside < found.num_gaussians <= inside
+    assert "PSNR" not in capsys.readouterr().out, "the photos show what is cut"
     assert run("export", tiny.folder, "-o", tmp_path / "a.ply", *words) == 0
     assert load(tmp_path / "a.ply").num_gaussians == found.num_gaussians
 
@@ -115,20 +107,6 @@ def test_levels_of_a_run_are_trained_from_the_cameras_of_its_photos(tiny, packed
     assert run("export", tiny.folder, "-o", tmp_path / "a", "--lod", "--upright") == 0
     assert len(given) == len(load(packed).cameras)
     assert load(tmp_path / "a").up == pytest.approx((0, -1, 0), abs=1e-6)
-
-
-def test_a_packed_scene_is_measured_on_its_capture(tiny, packed):
-    before, after = load_model(tiny.config), load_model(packed, data=tiny.scene)
-    for name in ("rgb", "base_rgb"):
-        assert 0 < abs(quality(before, name) - quality(after, name)) < 0.15
-    assert torch.equal(before.cameras[1].camera_to_worlds, after.cameras[1].camera_to_worlds)
-
-
-def test_a_warm_start_reads_a_packed_scene(packed):
-    (params, in_model_frame), truth = read_gaussians(packed), load(packed)
-    assert in_model_frame
-    assert "features" not in params
-    assert all(torch.equal(value, truth.gaussians[name]) for name, value in params.items())
 
 
 def test_a_pack_without_its_capture_says_that_it_is_not_measured(tiny, tmp_path, capsys):
@@ -160,7 +138,7 @@ def test_a_target_of_bytes_is_met_and_used(tiny, tmp_path, capsys):
         assert 0.93 * limit < found["bytes"] <= limit
 
 
-def test_the_quality_before_and_after_is_stated(tiny, tmp_path, capsys):
+def test_a_target_of_quality_is_met_and_states_it(tiny, tmp_path, capsys):
     found = figures(capsys, tiny.folder, "-o", tmp_path / "a.sundae", "--target-drop", 0.005)
     (before, after), (before_ssim, after_ssim) = found["psnr"], found["ssim"]
     assert before - 0.005 <= after < before + 0.05
@@ -200,24 +178,18 @@ def search(scene, drop, config=None):
     return Search(scene, config or PackConfig(), lambda: Stated(drop))
 
 
-class Tuned(NamedTuple):
-    scene: PackedScene
-    codecs: Codecs
-    bytes: int
-    """Of the pack without a target."""
-
-    def search(self, drop):
-        return Search(self.scene, self.codecs, lambda: Stated(drop, self.codecs))
+def search_tuned(tuned, drop):
+    return Search(tuned.scene, tuned.codecs, lambda: Stated(drop, tuned.codecs))
 
 
 @pytest.fixture(scope="module")
 def tuned(scene):
-    """A scene whose rows have moved since its codecs were fitted, as training moves them."""
+    """A pack of a scene whose rows have moved since its codecs were fitted, as training moves them."""
     fitted, codecs = fit_scene(scene, PackConfig(**FINETUNED))
     generator = torch.Generator().manual_seed(0)
     for name in codecs.gaussians:
         fitted.gaussians[name] += 0.3 * torch.randn(fitted.gaussians[name].shape, generator=generator)
-    return Tuned(fitted, codecs, len(pack_bytes(fitted, codecs)[0]))
+    return Candidate(fitted, codecs, len(pack_bytes(fitted, codecs)[0]))
 
 
 def test_the_search_uses_what_is_allowed(scene):
@@ -239,8 +211,8 @@ def test_a_target_is_never_larger_than_a_default_that_meets_it(scene):
 
 def test_a_target_begins_with_the_pack_of_the_fine_tune(tuned):
     """Not with grids, bases and steps that are fitted anew, which the training did not know."""
-    search = tuned.search(lambda config: config.harmonics_step)
-    assert search.default == (tuned.scene, tuned.codecs, tuned.bytes)
+    search = search_tuned(tuned, lambda config: config.harmonics_step)
+    assert search.default == tuned
     lost = FINETUNED["harmonics_step"]
     for limit, least in ((lost, 0.95 * lost), (2 * lost, 1.9 * lost), (0.5 * lost, 0.45 * lost)):
         found = search.better_than(limit)
@@ -254,7 +226,7 @@ def test_a_target_begins_with_the_pack_of_the_fine_tune(tuned):
 
 @pytest.mark.parametrize(("drop", "helps"), [(0.01, True), (0.5, False)])
 def test_a_fine_tune_that_does_not_help_is_left_out(scene, tuned, drop, helps):
-    plain, other = search(scene, lambda config: config.harmonics_step), tuned.search(lambda _: drop)
+    plain, other = search(scene, lambda config: config.harmonics_step), search_tuned(tuned, lambda _: drop)
     limits = {"most_drop": 0.02}, {"most_bytes": tuned.bytes}, {"most_bytes": plain.default.bytes}
     most = tuned.bytes if helps else plain.default.bytes
     assert tuned.bytes < plain.default.bytes
@@ -302,21 +274,7 @@ def test_steps_grow_together():
 
 # ----------------------------------------------------------------------------------------------------------- fine-tune
 
-COARSE = PackConfig(
-    position_bits=12,
-    scale_step=0.3,
-    rotation_step=0.08,
-    color_step=0.9,
-    opacity_step=0.5,
-    harmonics_step=1.0,
-    feature_step=0.3,
-    head_step=0.1,
-)
-
-
-def digests(folder):
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+COARSE = PackConfig(position_bits=12, **dict(zip(STEPS, (0.3, 0.08, 0.9, 0.5, 1.0, 0.3, 0.1), strict=True)))
 
 
 def test_training_makes_up_for_the_rounding(tiny, scene, tmp_path, monkeypatch):
@@ -329,11 +287,11 @@ def test_training_makes_up_for_the_rounding(tiny, scene, tmp_path, monkeypatch):
         seen.append({name: value.detach().clone() for name, value in training._model.named_parameters()})
         return result
 
-    before = digests(tiny.folder)
+    before = contents(tiny.folder)
     with monkeypatch.context() as patch:
         patch.setattr(RoundedTraining, "step", watched)
         trained, codecs = finetune(tiny.folder, scene, COARSE, 60, progress=losses.append)
-    assert digests(tiny.folder) == before
+    assert contents(tiny.folder) == before
     assert len(losses) == len(seen) == 60
     # Images are made of rounded values: rounding them again changes nothing.
     for state in (seen[0], seen[1], seen[-1]):
@@ -400,15 +358,14 @@ def test_an_interrupt_leaves_nothing(tiny, tmp_path, monkeypatch):
         return 1.0
 
     monkeypatch.setattr(tuned_packs, "rate_factor", interrupted)
-    before = digests(tiny.folder)
-    with pytest.raises(KeyboardInterrupt):
-        pack(tiny.folder, tmp_path / "a.sundae", advanced=PackDetails(finetune=5))
-    assert not list(tmp_path.iterdir())
-    (tmp_path / "a.sundae").write_text("the one of yesterday")
-    with pytest.raises(KeyboardInterrupt):
-        pack(tiny.folder, tmp_path / "a.sundae", advanced=PackDetails(finetune=5, overwrite=True))
-    assert [path.read_text() for path in tmp_path.iterdir()] == ["the one of yesterday"]
-    assert digests(tiny.folder) == before
+    before = contents(tiny.folder)
+    for text in ("", "the one of yesterday"):
+        if text:
+            (tmp_path / "a.sundae").write_text(text)
+        with pytest.raises(KeyboardInterrupt):
+            pack(tiny.folder, tmp_path / "a.sundae", advanced=PackDetails(finetune=5, overwrite=bool(text)))
+        assert [path.read_text() for path in tmp_path.iterdir()] == ([text] if text else [])
+    assert contents(tiny.folder) == before
 
 
 def test_full_memory_is_one_line(tiny, scene, monkeypatch):
@@ -421,16 +378,10 @@ def test_full_memory_is_one_line(tiny, scene, monkeypatch):
         finetune(tiny.folder, scene, PackConfig(), 1)
 
 
-def test_a_run_of_splatfacto(tiny, scene, tmp_path):
-    config = copy.deepcopy(all_methods["splatfacto"])
-    config.data = config.pipeline.datamanager.data = tiny.scene
-    config.pipeline.model.sh_degree = 2
+def test_a_run_of_splatfacto(scene, stock_run, tmp_path):
     rest = 0.1 * torch.randn(len(scene.gaussians["means"]), 8, 3)
     rest[::2] = 0  # these colours stay view-independent
-    state = {f"_model.gauss_params.{name}": value for name, value in scene.gaussians.items() if name != "features"}
-    state |= {"_model.gauss_params.features_rest": rest, "_model.device_indicator_param": torch.zeros(0)}
-    checkpoint.write({"step": 29999, "pipeline": state}, tmp_path / "nerfstudio_models" / "step-000029999.ckpt")
-    (tmp_path / "config.yml").write_text(yaml.dump(config))
+    stock_run(tmp_path, {**scene.gaussians, "features_rest": rest}, 29999)
     stock = contents_of(load_run(tmp_path, max_cameras=0))
     trained, codecs = finetune(tmp_path, stock, PackConfig(), 3)
     assert codecs.head is None
@@ -459,8 +410,7 @@ def test_rates_rise_and_fall_to_nothing():
         assert all(0 < factor <= 1 for factor in factors)
         top = factors.index(max(factors))
         assert factors == sorted(factors[:top]) + sorted(factors[top:], reverse=True)
-    assert factors[-1] < 1e-4
-    assert factors[0] < 0.05
+    assert factors[-1] < 1e-4 < factors[0] < 0.05
 
 
 def test_gradients_follow_a_quaternion_to_its_negative():

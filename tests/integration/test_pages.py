@@ -20,8 +20,8 @@ ELSEWHERE = {
     "run walk.mp4": "the same of a video; cli/test_run.py reads its commands, data/test_reconstruct.py makes captures",
     "poses ": "takes minutes; data/test_reconstruct.py finds the poses of a still life",
     "train CAPTURE": "becomes ns-train, in place of this process; cli/test_train.py reads its command",
-    "python benchmarks/quality.py": "trains a dozen runs; test_comparisons.py runs it with two short ones",
-    "python benchmarks/suite.py": "trains every method on every capture; test_comparisons.py trains one method",
+    "python benchmarks/quality.py": "trains a dozen runs; test_benchmarks.py runs it with two short ones",
+    "python benchmarks/suite.py": "trains every method on every capture; test_benchmarks.py trains one method",
     "view scene.sundae": "serves until Ctrl-C; cli/test_view.py serves a page, and opens and ends it",
     "ns-train sundae --machine.num-devices 2": "needs two GPUs; plugin/test_whole_runs.py trains on two",
 }
@@ -33,8 +33,6 @@ SHORTER = {"--finetune": "2", "--view": "2", "--width": "32", "--height": "24", 
 """Values that suit a small run and a small scene."""
 MORE = {"prune": ["--num-cameras", "4"], "render": ["--width", "32"]}
 """Options that shorten commands of ``sundae`` further."""
-
-
 OURS = ("sundae ", "python benchmarks/")
 
 
@@ -85,11 +83,10 @@ def test_commands_run_as_they_stand(page, tiny, tmp_path, monkeypatch):
 def test_nothing_is_left_out_without_need():
     left_out = [start for page in PAGES for line in lines_of(page, "") for start in elsewhere(line)]
     assert set(left_out) == set(ELSEWHERE)
-
-
-def test_the_readme_has_commands_to_run():
     found = {words[1] for words in commands_of(PAGES[0])}
-    assert {"doctor", "pack", "export", "prune", "compare"} <= found
+    assert {"doctor", "pack", "export", "prune", "compare"} <= found, "README has commands to run"
+    programs = {line.split()[0] for page in PAGES for line in lines_of(page, "ns-")}
+    assert programs == {"ns-train", "ns-eval", "ns-viewer"}, "tests below run these"
 
 
 @pytest.fixture
@@ -136,8 +133,3 @@ def test_commands_on_runs_run(call_here, monkeypatch):
         call_here(*words)
         assert Path("eval.json").is_file() == (words[0] == "ns-eval")
     assert len(shown) == sum(words[0] == "ns-viewer" for words in commands)
-
-
-def test_no_other_program_of_nerfstudio_is_named_in_a_block():
-    programs = {line.split()[0] for page in PAGES for line in lines_of(page, "ns-")}
-    assert programs == {"ns-train", "ns-eval", "ns-viewer"}

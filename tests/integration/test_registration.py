@@ -13,18 +13,8 @@ from sundae_ns.plugin.datamanager import SundaeDatamanager
 from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.plugin.trainer import SundaeTrainer
 
-METHODS = {
-    "sundae": None,
-    "sundae-1": 0.01,
-    "sundae-30": 0.3,
-    "sundae-50": 0.5,
-    "sundae-80": 0.8,
-    "sundae-100": 1.0,
-    "sundae-continuous": 0.5,
-    "sundae-fast": 0.1,
-    "sundae-paper": 0.1,
-    "sundae-tiny": 0.25,
-}
+METHODS = {"sundae": None, **{f"sundae-{percent}": percent / 100 for percent in (1, 30, 50, 80, 100)}}
+METHODS |= {"sundae-continuous": 0.5, "sundae-fast": 0.1, "sundae-paper": 0.1, "sundae-tiny": 0.25}
 
 
 def ours():
@@ -44,9 +34,9 @@ RULE = ("score", "selection", "redistribution", "edges", "signal")
 @pytest.mark.parametrize("name", METHODS)
 def test_configuration(name):
     method = ours()[name]
+    config = method.config
     assert isinstance(method, MethodSpecification)
     assert method.description
-    config = method.config
     assert config.method_name == name
     assert config._target is SundaeTrainer
     assert config.viewer.quit_on_train_completion
@@ -82,16 +72,16 @@ def test_methods_share_no_objects():
 def test_import_is_light_and_errors_of_ns_train_are_one_line():
     masked = ("open3d", "torchmetrics", "wandb", "comet_ml", "tinycudann")
     # An import error here would break every ns-* command, and so would importing what imports the entry points.
-    code = (
-        "import sys\n"
-        "sys.argv = ['/usr/bin/ns-train']\n"
-        f"for name in {masked!r}: sys.modules[name] = None\n"
-        "import sundae_ns.method_configs as configs\n"
-        "assert configs.sundae.config.method_name == 'sundae'\n"
-        "assert 'nerfstudio.configs.method_configs' not in sys.modules\n"
-        "from sundae_ns.core.errors import DataError\n"
-        "raise DataError('the cause; the mend')\n"
-    )
+    code = f"""
+import sys
+sys.argv = ["/usr/bin/ns-train"]
+for name in {masked!r}: sys.modules[name] = None
+import sundae_ns.method_configs as configs
+assert configs.sundae.config.method_name == "sundae"
+assert "nerfstudio.configs.method_configs" not in sys.modules
+from sundae_ns.core.errors import DataError
+raise DataError("the cause; the mend")
+"""
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (result.returncode, result.stderr.splitlines()[-1]) == (1, "sundae: the cause; the mend"), result.stderr
     assert "Traceback" not in result.stderr

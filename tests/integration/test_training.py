@@ -3,7 +3,6 @@
 import gc
 import json
 import re
-import shutil
 import signal
 import sys
 import tracemalloc
@@ -11,7 +10,7 @@ import tracemalloc
 import kill_and_resume
 import pytest
 import torch
-import yaml
+from models import Training
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.eval_utils import eval_setup
@@ -19,11 +18,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torch import Tensor
 from trial_runs import served_views
 
-from sundae_ns.core.errors import BackendError, CheckpointError, DataError, MemoryExhaustedError
+from sundae_ns.core.errors import BackendError, MemoryExhaustedError
 from sundae_ns.core.gaussians import SPLAT_NAMES
 from sundae_ns.io import checkpoint
 from sundae_ns.io.ply import MODEL_FRAME, write_ply
-from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.plugin.datamanager import SundaeDatamanager
 from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.train import initialize
@@ -59,20 +57,9 @@ def test_prune_keeps_exactly_the_share(tiny, report):
     assert f"kept {report['after']:,} of {report['before']:,} Gaussians" in " ".join(tiny.output.split())
 
 
-def test_the_schedule_follows_the_number_of_steps(tiny):
-    """A tenth of the method's own steps; what the command sets stays."""
-    config = yaml.load(tiny.config.read_text(), Loader=yaml.Loader)
-    model, rates = config.pipeline.model, config.optimizers["compensation"]["scheduler"]
-    assert config.schedule_length == tiny.steps == sundae_tiny.config.max_num_iterations // 10
-    assert model.stop_split_at == sundae_tiny.config.pipeline.model.stop_split_at // 10
-    assert (rates.max_steps, rates.warmup_steps) == (tiny.steps, tiny.steps // 12)
-    assert (model.pruning.prune_at, model.refine_every) == (tiny.prune_at, 15)
-    assert f"{tiny.steps} steps" in tiny.output
-    assert re.search(rf"prune .* after {tiny.prune_at}", tiny.output)
-
-
 def test_a_finished_training_says_what_it_made(tiny, report):
-    """Quality, size and the next command."""
+    """The schedule first; then quality, size and the next command."""
+    assert re.search(rf"prune .* after {tiny.prune_at}", tiny.output)
     found = re.search(r"trained: PSNR (\d+\.\d\d) dB, SSIM 0\.\d{4} on 3 test views\n(.*)\nnext: (.*)\n", tiny.output)
     assert 5 < float(found[1]) < 60
     assert re.fullmatch(rf"{report['after']:,} Gaussians, with a head: 0\.\d\d MB before packing", found[2])
@@ -118,27 +105,7 @@ def test_checkpoints_are_plain_and_hold_no_lpips(tiny, step, pruned_at):
         assert (moments == {}) if (name, step) == ("features", 30) else moments["exp_avg"].shape == value.shape
 
 
-def test_ns_train_names_bad_input(tiny, call_here, tmp_path):
-    """In one line: test_registration.py raises such an error in a process of its own."""
-    data = shutil.copytree(tiny.scene, tmp_path / "scene")
-    meta = json.loads((data / "transforms.json").read_text())
-    meta["frames"][3]["transform_matrix"][0][3] = float("nan")
-    (data / "transforms.json").write_text(json.dumps(meta))
-    with pytest.raises(DataError, match=r"^transforms\.json, frame 3 \(.*transform_matrix is nan; it must be finite"):
-        call_here("ns-train", "sundae-tiny", "--data", data, "--output-dir", tmp_path / "out", "--vis", "tensorboard")
-
-
 # ------------------------------------------------------------------------------------------------------------- resumed
-
-
-def assert_live(trainer):
-    """Model, optimizers and nerfstudio's own list hold the same tensors, with moments of their shape."""
-    optimizers = trainer.optimizers
-    for name, value in trainer.pipeline.model.gauss_params.items():
-        (held,) = optimizers.optimizers[name].param_groups[0]["params"]
-        assert held is value
-        assert optimizers.parameters[name] == [value]
-        assert optimizers.optimizers[name].state[value]["exp_avg"].shape == value.shape
 
 
 def assert_same(whole, resumed):
@@ -157,29 +124,24 @@ def assert_same(whole, resumed):
     assert torch.equal(whole["random"]["torch"], resumed["random"]["torch"])
 
 
-@pytest.mark.parametrize("start", [30, 60], ids=["before the prune", "after the prune"])
-def test_a_resumed_run_ends_like_one_that_never_stopped(tiny, report, resumed, start):
-    trainer = resumed(tiny.checkpoints, start, tiny.save_every)
+def test_a_resumed_run_ends_like_one_that_never_stopped(tiny, report, resumed):
+    trainer = resumed(tiny.checkpoints, 60, tiny.save_every)
     served, model = served_views(trainer), trainer.pipeline.model
     before = {name: value.detach().clone() for name, value in model.gauss_params.items()}
     trainer.train()
-
-    end = start + tiny.save_every
     # The views that an uninterrupted run sees at these steps.
     fresh = trainer.config.pipeline.datamanager.setup(device="cpu", test_mode="val")
-    assert served == [fresh.view_of_step(step) for step in range(start + 1, end + 1)]
-    assert model.num_points == report["after"]
+    assert served == [fresh.view_of_step(step) for step in range(61, 91)]
     assert (model.state.pruning["num_prunes"], model.state.pruning["pruned_at"]) == (1, tiny.prune_at)
     # The record of a prune before the checkpoint comes from the folder of the run that is resumed.
-    (again,) = json.loads((trainer.base_dir / "prune.json").read_text())
-    assert all(again[name] == report[name] for name in ("step", "before", "after", "peak"))
-    assert_live(trainer)
-    if start > tiny.prune_at:
-        assert all((value.detach() - before[name]).abs().max() > 0 for name, value in model.gauss_params.items())
-    assert_same(load(tiny.checkpoint(end)), load(trainer.checkpoint_dir / f"step-{end:09d}.ckpt"))
+    assert json.loads((trainer.base_dir / "prune.json").read_text()) == [report]
+    assert Training.live(trainer)  # that stands for a trainer
+    assert all((value.detach() - before[name]).abs().max() > 0 for name, value in model.gauss_params.items())
+    assert_same(load(tiny.checkpoint(90)), load(trainer.checkpoint_dir / "step-000000090.ckpt"))
 
 
-def test_a_signal_saves_and_the_resumed_run_ends_like_one_that_never_stopped(tiny, resumed, capsys):
+def test_a_signal_saves_and_the_resumed_run_ends_like_one_that_never_stopped(tiny, report, resumed, capsys):
+    """Resumed before the prune, and stopped after it."""
     trainer = resumed(tiny.checkpoints, 30, 30)
     serve = trainer.pipeline.datamanager.next_train
 
@@ -198,6 +160,8 @@ def test_a_signal_saves_and_the_resumed_run_ends_like_one_that_never_stopped(tin
     last = capsys.readouterr().out.splitlines()[-1].split()
     assert last[:2] == ["ns-train", "sundae-tiny"]
     assert last[last.index("--load-dir") + 1] == str(trainer.checkpoint_dir)
+    (prune,) = json.loads((trainer.base_dir / "prune.json").read_text())
+    assert all(prune[name] == report[name] for name in ("step", "before", "after", "peak"))
 
     again = resumed(trainer.checkpoint_dir.parent, None, 10)  # the run's folder
     assert writer.GLOBAL_BUFFER["max_iter"] == 61, "progress counts the steps before"
@@ -221,18 +185,19 @@ def test_a_signal_before_the_first_step_saves_nothing(trainer_of, monkeypatch):
     assert end.value.code == 130
 
 
-def test_killed_anywhere_it_goes_on_as_if_never_killed(monkeypatch, capsys):
+def test_killed_while_it_saves_it_goes_on_as_if_never_killed(monkeypatch, capsys):
     """The short version of ``benchmarks/kill_and_resume.py``, which says where the kills fall."""
-    monkeypatch.setattr(sys, "argv", ["kill_and_resume.py", "--kinds", "training", "--kills", "2"])
+    monkeypatch.setattr(sys, "argv", ["kill_and_resume.py", "--kinds", "training", "--kills", "1", "--seed", "1"])
     with pytest.raises(SystemExit, match="0"):
         kill_and_resume.main()
     found = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert found["killed"] == found["one prune"] == found["the same result"] == found["nothing left lying"] == 2
+    names = ("at save: half written", "killed", "one prune", "the same result", "nothing left lying")
+    assert [found[name] for name in names] == [1] * 5
     assert found["same seed, same result"]
 
 
 def test_memory_does_not_grow_past_the_prune(tiny, resumed):
-    steps, settled, seen = 60, 20, []
+    steps, settled, seen = 40, 20, []
     trainer = resumed(tiny.checkpoints, 60, steps, model={"average_share": 1.0})  # from the first step on
     iterate = trainer.train_iteration
 
@@ -266,36 +231,31 @@ def test_full_memory_in_the_backward_pass(tiny, resumed, monkeypatch):
         trainer.train()
 
 
-def saved(folder, tiny, change):
-    """A checkpoint of the tiny run from before the prune, changed by a function."""
-    state = load(tiny.checkpoint(30))
-    change(state["pipeline"])
-    torch.save(state, folder / "step-000000030.ckpt")
-    return folder
-
-
-def test_a_splatfacto_checkpoint_is_refused(tiny, trainer_of, tmp_path):
-    def strip(pipeline):
-        for name in [name for name in pipeline if not name.startswith("_model.gauss_params.") or "features" in name]:
-            del pipeline[name]
-
-    with pytest.raises(ValueError, match="warm-start"):
-        trainer_of(load_checkpoint=saved(tmp_path, tiny, strip) / "step-000000030.ckpt")
-
-
-@pytest.mark.parametrize("option", ["load_dir", "pipeline.model.warm_start"])
-def test_a_checkpoint_of_format_1_is_refused_in_one_line(tiny, trainer_of, tmp_path, option):
-    extra = {"method": "sundae", "format": 1, "step": 30, "num_features": 5}
-    folder = saved(tmp_path, tiny, lambda pipeline: pipeline.update({"_model._extra_state": extra}))
-    with pytest.raises(CheckpointError, match=r"^.*format 1, this version reads 2; use the version that wrote.*$"):
-        trainer_of(**{option: folder})
-
-
 # ---------------------------------------------------------------------------------------------------------- warm starts
 
 
-def check_warm(tiny, trainer_of, params, path):
-    trainer = trainer_of(model={"warm_start": path}, max_num_iterations=3)
+def stock_checkpoint(path, params):
+    """What nerfstudio saves, whose scheduler torch loads only where everything is loaded."""
+    optimizer = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr=1.6e-4)
+    config = ExponentialDecaySchedulerConfig(lr_final=1.6e-6, max_steps=100)
+    scheduler = config.setup().get_scheduler(optimizer, lr_init=1.6e-4)
+    optimizer.step()
+    scheduler.step()
+    pipeline = {f"_model.gauss_params.{name}": value for name, value in params.items()}
+    torch.save({"step": 29999, "pipeline": pipeline, "schedulers": {"means": scheduler.state_dict()}}, path)
+    with pytest.raises(Exception, match="[Ww]eights.only"):
+        load(path)
+
+
+@pytest.mark.parametrize(("source", "step"), [("nerfstudio_models", 119), ("a.ply", 119), ("step-000029999.ckpt", 30)])
+def test_warm_start(tiny, trainer_of, tmp_path, source, step):
+    params = {name: value for name, value in gaussians(load(tiny.checkpoint(step))).items() if name in SPLAT_NAMES}
+    path = tmp_path / source
+    if path.suffix == ".ply":
+        write_ply(path, params, comments=[MODEL_FRAME])
+    elif path.suffix == ".ckpt":
+        stock_checkpoint(path, params)
+    trainer = trainer_of(model={"warm_start": path if path.suffix else tiny.checkpoints}, max_num_iterations=3)
     model = trainer.pipeline.model
     for name in SPLAT_NAMES:
         assert torch.equal(model.gauss_params[name].cpu(), params[name]), name
@@ -306,32 +266,8 @@ def check_warm(tiny, trainer_of, params, path):
     assert found["after"] == model.num_points == kept
     assert model.state.pruning["num_prunes"] == 1
     assert model.state.head_enabled
-    assert_live(trainer)
+    assert Training.live(trainer)
     assert load(trainer.checkpoint_dir / "step-000000002.ckpt")["step"] == 2
-
-
-@pytest.mark.parametrize("source", ["checkpoint", "ply", "exported"])
-def test_warm_start(tiny, trainer_of, tmp_path, source, request):
-    params = {name: value for name, value in gaussians(load(tiny.checkpoint(119))).items() if name in SPLAT_NAMES}
-    path = {"checkpoint": tiny.checkpoints, "ply": tmp_path / "a.ply"}.get(source)
-    if source == "ply":
-        write_ply(path, params, comments=[MODEL_FRAME])
-    check_warm(tiny, trainer_of, params, path or request.getfixturevalue("exported"))
-
-
-def test_warm_start_from_a_stock_checkpoint(tiny, trainer_of, tmp_path):
-    params = {name: value for name, value in gaussians(load(tiny.checkpoint(30))).items() if name in SPLAT_NAMES}
-    optimizer = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr=1.6e-4)
-    config = ExponentialDecaySchedulerConfig(lr_final=1.6e-6, max_steps=100)
-    scheduler = config.setup().get_scheduler(optimizer, lr_init=1.6e-4)
-    optimizer.step()
-    scheduler.step()
-    path = tmp_path / "step-000029999.ckpt"
-    pipeline = {f"_model.gauss_params.{name}": value for name, value in params.items()}
-    torch.save({"step": 29999, "pipeline": pipeline, "schedulers": {"means": scheduler.state_dict()}}, path)
-    with pytest.raises(Exception, match="[Ww]eights.only"):
-        load(path)
-    check_warm(tiny, trainer_of, params, path)
 
 
 def test_few_views_start_from_more_points_and_resume_without_looking_for_them_again(
@@ -366,57 +302,27 @@ class Failing(RecordedStep):
         return super()._step(*arguments)
 
 
-def recorded(trainer_of, seed, steps=None):
-    """A run of the tiny scene through growth, prune and trials of the head; by recorded steps, kernel by kernel."""
-    torch.manual_seed(seed)
-    # A failed step draws a random background twice.
-    trainer = trainer_of(steps_per_save=40, save_only_latest_checkpoint=False, model={"background_color": "black"})
-    if steps is not None:
-        trainer._recorded = steps(trainer.model.losses, record=False)
-    trainer.train()
-    return trainer
-
-
-def difference(one, other):
-    """Largest difference of the quartiles of any parameter; infinite if numbers of Gaussians differ by over 2%."""
-    if one.num_points != pytest.approx(other.num_points, rel=0.02):
-        return float("inf")
-    shares = torch.tensor([0.25, 0.5, 0.75])
-    names = ("means", "scales", "opacities", "features_dc")
-    quartiles = [[model.gauss_params[name].detach().quantile(shares) for name in names] for model in (one, other)]
-    return max(float((a - b).abs().max()) for a, b in zip(*quartiles, strict=True))
-
-
-@pytest.fixture(scope="module")
-def usual_runs():
-    """Usual runs by seed, with which both tests compare."""
-    return {}
-
-
 @pytest.mark.parametrize("steps", [RecordedStep, Failing])
-def test_a_run_by_recorded_steps_is_the_same_also_if_they_fail(trainer_of, usual_runs, steps, capsys):
-    """At the first of a few seeds.
-
-    Rounding decides about Gaussians at thresholds of densification. Of ten seeds two part by 0.03 and 0.07, six by
-    0.004 to 0.02, and two agree to 1e-5; which ones, depends on the processor. With L1 in place of the root all part by
-    0.04 and more.
-    """
-    found = []
-    for seed in (5, 1, 2):
-        usual = usual_runs[seed] if seed in usual_runs else usual_runs.setdefault(seed, recorded(trainer_of, seed))
-        trainer = recorded(trainer_of, seed, steps)
-        found.append(difference(trainer.model, usual.model))
-        if found[-1] < 0.02:
-            break
-    assert found[-1] < 0.02, found
+def test_a_run_by_recorded_steps_is_the_same_also_if_they_fail(trainer_of, steps, capsys):
+    """Until the field grows: rounding decides about Gaussians at thresholds of densification."""
+    shares, quartiles, options = torch.tensor([0.25, 0.5, 0.75]), [], {"steps_per_save": 20, "max_num_iterations": 30}
+    for recorded in (False, True):
+        torch.manual_seed(5)
+        trainer = trainer_of(model={"background_color": "black"}, **options)  # a failed step draws a random one twice
+        if recorded:
+            trainer._recorded = steps(trainer.model.losses, record=False)
+        trainer.train()
+        fields = (trainer.model.gauss_params[name].detach() for name in ("means", "scales", "opacities", "features_dc"))
+        quartiles.append(torch.cat([field.quantile(shares) for field in fields]))
+    print((quartiles[0] - quartiles[1]).abs().max())
+    torch.testing.assert_close(*quartiles, rtol=0, atol=0.001)
     assert (trainer._recorded is None) == (steps is Failing)
     told = "without recordings, slower: no memory for a recording" in " ".join(capsys.readouterr().out.split())
     assert told == (steps is Failing)
-    for path in sorted(trainer.checkpoint_dir.glob("*.ckpt")):
-        loaded = checkpoint.read(path)
-        means = loaded["pipeline"]["_model.gauss_params.means"]
-        assert means.untyped_storage().nbytes() == means.numel() * 4  # and not the memory beyond the Gaussians
-        assert loaded["optimizers"].keys() == usual.optimizers.optimizers.keys()
+    loaded = checkpoint.read(checkpoint.newest_whole(trainer.checkpoint_dir)[0])
+    means = loaded["pipeline"]["_model.gauss_params.means"]
+    assert means.untyped_storage().nbytes() == means.numel() * 4  # and not the memory beyond the Gaussians
+    assert loaded["optimizers"].keys() == trainer.optimizers.optimizers.keys()
     events = [str(event["name"]) for event in writer.EVENT_STORAGE]
     assert not [name for name in events if name.startswith("learning_rate")]  # all are written
 
@@ -471,14 +377,8 @@ def test_memory_that_runs_out_is_named_and_training_goes_on_from_the_last_checkp
     little_memory(torch.cuda.memory_reserved() + ROOM)
     with pytest.raises(MemoryExhaustedError) as raised:
         trainer.train()
-    found = re.fullmatch(
-        r"the GPU's memory is full: cannot allocate [\d.]+ [KMG]iB more with ([\d,]+) Gaussians; try "
-        r"--pipeline\.datamanager\.cache-images cpu \(.*\), "
-        r"--pipeline\.datamanager\.camera-res-scale-factor 0\.5 \(.*\), "
-        r"or --pipeline\.model\.pruning\.mode continuous .*--pipeline\.model\.pruning\.max-gaussians (\d+) \(.*\); "
-        r"--load-dir resumes from the last checkpoint",
-        str(raised.value),
-    )
+    words = r"the GPU's memory is full: cannot allocate [\d.]+ [KMG]iB more with ([\d,]+) Gaussians; try .* 0\.5 .*"
+    found = re.fullmatch(rf"{words}max-gaussians (\d+) \(.*\); --load-dir resumes from .*", str(raised.value))
     assert found, str(raised.value)
     count = int(found[1].replace(",", ""))
     assert count > 10 * tiny.points

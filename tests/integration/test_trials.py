@@ -111,7 +111,7 @@ LEVEL = {1.0: 0.0, 0.4: 0.0, 0.2: 0.05, 0.1: 1.0, 0.05: 2.0, 0.025: 3.0}
 
 
 def test_trials_choose_the_count_and_leave_nothing_else_behind(make_counting, judge_counts):
-    judge_counts(LEVEL)
+    judge_counts(LEVEL, 0.2)
     trainer = make_counting(head="auto")
     served, model, fields = served_views(trainer), trainer.pipeline.model, {}
     deciding, pruning = trials_of(model), next(one for one in model.train_callbacks if one.name == "pruning")
@@ -146,15 +146,17 @@ def test_trials_choose_the_count_and_leave_nothing_else_behind(make_counting, ju
     assert [point.count for point in points] == [one["count"] for one in record["curve"]]
     (prune,) = json.loads((trainer.base_dir / "prune.json").read_text())
     assert (prune["before"], prune["after"], prune["step"]) == (full, chosen, record["step"])
+    # The head gains too little for its bytes, which are several times those of these Gaussians.
+    assert not record["head"]["pays"]
+    assert records_of(trainer)["head"]["decision"] == "plain"
+    assert model.state.head is None
 
 
-@pytest.mark.parametrize(("gain", "decision"), [(4.0, "head"), (0.2, "plain")])
-def test_a_head_that_gains_at_a_tenth_is_kept_with_more(make_counting, judge_counts, gain, decision):
-    """If it gains enough for its bytes, which are several times those of these Gaussians."""
-    judge_counts(LEVEL, gain)
+def test_a_head_that_gains_at_a_tenth_is_kept_with_more(make_counting, judge_counts):
+    judge_counts(LEVEL, 4.0)
     trainer = make_counting(head="auto")
-    model = trainer.pipeline.model
-    fresh, settled = {name: value.clone() for name, value in model.state.head.state_dict().items()}, {}
+    model, settled = trainer.pipeline.model, {}
+    fresh = {name: value.clone() for name, value in model.state.head.state_dict().items()}
     deciding = trials_of(model)
     settle = deciding._finish_with
 
@@ -165,16 +167,14 @@ def test_a_head_that_gains_at_a_tenth_is_kept_with_more(make_counting, judge_cou
     deciding._finish_with = finish_with
     trainer.train()
     record, verdict = records_of(trainer)["count"], records_of(trainer)["head"]
-    assert (record["head"]["pays"], verdict["decision"]) == (decision == "head", decision)
-    assert record["head"]["head"]["psnr"] - record["head"]["plain"]["psnr"] == pytest.approx(gain)
-    assert verdict["step"] == record["step"]
-    assert (model.state.head is None) == (decision == "plain")
+    assert record["head"]["pays"]
+    assert record["head"]["head"]["psnr"] - record["head"]["plain"]["psnr"] == pytest.approx(4.0)
+    assert (verdict["decision"], verdict["step"]) == ("head", record["step"])
     # What the head learnt on a tenth does not fit the chosen Gaussians.
     same(fresh, settled)
-    if decision == "head":
-        assert any(not torch.equal(fresh[name], value) for name, value in model.state.head.state_dict().items())
-        assert head_steps(model) == STEPS - 1 - record["step"]
-        assert not model.state.provisional
+    assert any(not torch.equal(fresh[name], value) for name, value in model.state.head.state_dict().items())
+    assert head_steps(model) == STEPS - 1 - record["step"]
+    assert not model.state.provisional
 
 
 def test_where_a_tenth_is_kept_the_head_has_its_usual_trials(make_counting, judge_counts):
@@ -189,23 +189,18 @@ def test_where_a_tenth_is_kept_the_head_has_its_usual_trials(make_counting, judg
 
 
 def test_a_head_in_any_case_rests_during_the_trials_and_counts_its_own_steps(make_counting, judge_counts):
+    """Within a budget, which works on the same curve."""
     judge_counts(LEVEL)
-    trainer = make_counting(head="residual")
+    trainer = make_counting(head="residual", max_gaussians=9)
     model, enabled = trainer.pipeline.model, []
     after_each_step(model.train_callbacks[-1], lambda run: enabled.append(run.state.head_enabled))
     trainer.train()
-    decided = records_of(trainer)["count"]["step"]
-    assert not any(enabled[:decided])
-    assert all(enabled[decided + 1 :])
-    assert head_steps(model) == STEPS - 1 - decided
+    record = records_of(trainer)["count"]
+    assert model.num_points == record["chosen"] == 9
+    assert not any(enabled[: record["step"]])
+    assert all(enabled[record["step"] + 1 :])
+    assert head_steps(model) == STEPS - 1 - record["step"]
     assert not model.state.provisional
-
-
-def test_a_budget_works_on_the_same_curve(make_counting, judge_counts):
-    judge_counts(LEVEL)
-    trainer = make_counting(max_gaussians=9)
-    trainer.train()
-    assert trainer.pipeline.model.num_points == records_of(trainer)["count"]["chosen"] == 9
 
 
 @pytest.mark.parametrize(
@@ -257,50 +252,18 @@ def images_of(trainer, *models):
         return [(output["rgb"], output["base_rgb"]) for output in outputs]
 
 
-def test_a_head_that_pays_stays_and_all_views_are_trained_on_again(make, judge_heads):
-    judge_heads(head=(0.5, 0.01))
+@pytest.mark.parametrize(
+    ("chosen", "width", "head", "features", "tried"),
+    [
+        ("plain", 0, (0.5, -0.001), (0.0, 0.0), 2),
+        ("head", 5, (0.5, 0.01), (0.5, 0.01), 3),
+        ("features", 29, (0.3, 0.01), (0.5, 0.02), 3),
+    ],
+)
+def test_the_trials_start_alike_and_the_chosen_field_continues(make, judge_heads, chosen, width, head, features, tried):
+    judge_heads(head, features)
     trainer = make()
-    served, model = served_views(trainer), trainer.pipeline.model
-    trainer.train()
-    record, decided = records_of(trainer)["head"], PRUNE_AT + 3 * LENGTH
-    held = set(record["held_out_views"])
-    assert (record["decision"], record["step"]) == ("head", decided)
-    assert record["arms"]["head"]["psnr"] == pytest.approx(20.5, abs=0.01)
-    assert record["arms"]["head"]["bytes"] == bytes_of(model.gauss_params) + bytes_of_module(model.head)
-    assert model.state.head_enabled
-    assert len(held) == 2
-    assert not held & set(served[31 : decided + 1])
-    assert held & set(served[:30])
-    assert held & set(served[decided + 1 :])
-    assert model.head.net.out.weight.abs().max() > 0
-
-
-@pytest.mark.parametrize("gains", [(0.5, -0.001), (math.nan, 0.01)])
-def test_a_head_that_does_not_pay_costs_nothing(make, judge_heads, gains):
-    judge_heads(head=gains)
-    trainer = make()
-    trainer.train()
-    model = trainer.pipeline.model
-    assert records_of(trainer)["head"]["decision"] == "plain"
-    assert model.head is None
-    assert model.gauss_params["features"].numel() == 0
-    saved = torch.load(next(trainer.checkpoint_dir.glob("*.ckpt")), map_location="cpu", weights_only=True)
-    assert not [name for name in saved["pipeline"] if "head" in name]
-    opened = eval_setup(trainer.base_dir / "config.yml", test_mode="test")[1].model
-    assert opened.head is None
-    (image, base), (again, _) = images_of(trainer, model, opened)
-    assert torch.equal(image, again)
-    assert torch.equal(image, base)
-    scene = contents_of(load_run(trainer.base_dir))
-    assert not scene.head
-    assert not any(value.numel() for name, value in scene.gaussians.items() if name == "features")
-
-
-@pytest.mark.parametrize(("chosen", "head", "features", "tried"), [("plain", -1.0, 0.0, 2), ("features", 0.3, 0.5, 3)])
-def test_the_trials_start_alike_and_the_chosen_field_continues(make, judge_heads, chosen, head, features, tried):
-    judge_heads(head=(head, 0.01), features=(features, 0.02))
-    trainer = make()
-    model = trainer.pipeline.model
+    model, served = trainer.pipeline.model, served_views(trainer)
     trial, seen, rates, head_rates = trials_of(model), {}, {}, {}
     act = trial.after_prune
 
@@ -328,18 +291,33 @@ def test_the_trials_start_alike_and_the_chosen_field_continues(make, judge_heads
     assert min(distances) == distances[place]
     record = records_of(trainer)["head"]
     assert (record["decision"], record["step"], len(record["arms"])) == (chosen, decided, tried)
+    decibels = 20 + {"plain": 0.0, "head": head[0], "features": features[0]}[chosen]
+    assert record["arms"][chosen]["psnr"] == pytest.approx(decibels, abs=0.01)
+    assert record["arms"][chosen]["bytes"] == bytes_of(model.gauss_params) + bytes_of_module(model.head)
+    held = set(record["held_out_views"])
+    assert len(held) == 2
+    assert not held & set(served[31 : decided + 1])
+    assert held & set(served[:30])
+    assert held & set(served[decided + 1 :])
     # A head that was chosen has trained for one trial.
     assert trial.taken_back == (tried - 1) * LENGTH
-    width = {"plain": 0, "head": 5, "features": 29}[chosen]
-    assert model.gauss_params["features"].shape[1] == width
-    assert (model.head is None) == (chosen == "plain")
+    # No head leaves nothing behind.
+    saved = torch.load(next(trainer.checkpoint_dir.glob("*.ckpt")), map_location="cpu", weights_only=True)
     opened = eval_setup(trainer.base_dir / "config.yml", test_mode="test")[1].model
-    (image, _), (again, _) = images_of(trainer, model, opened)
+    (image, base), (again, _) = images_of(trainer, model, opened)
     assert torch.equal(image, again)
-    assert contents_of(load_run(trainer.base_dir)).gaussians.get("features", torch.zeros(1, 0)).shape[1] == width
+    scene = contents_of(load_run(trainer.base_dir))
+    assert model.gauss_params["features"].shape[1] == width
+    assert scene.gaussians.get("features", torch.zeros(1, 0)).shape[1] == width
+    none = [
+        *(model.head is None, opened.head is None, not scene.head, torch.equal(image, base)),
+        not [name for name in saved["pipeline"] if "head" in name],
+    ]
+    assert none == [chosen == "plain"] * 5
 
 
 def test_with_few_views_two_are_held_out_in_turn(make, judge_heads):
+    """The second one stays held out for the length: the Gaussians that go on have not seen it in their trial."""
     judge_heads(head=(0.5, 0.01))
     trainer = make(8)
     served = served_views(trainer)
@@ -351,10 +329,15 @@ def test_with_few_views_two_are_held_out_in_turn(make, judge_heads):
     assert not any(first in trial for trial in served_by_trial[::2])
     assert not any(second in trial for trial in served_by_trial[1::2])
     assert trainer.pipeline.model.head.config.num_features == 5
+    watch = records_of(trainer)["length"]
+    assert watch["held_out_views"] == [second]
+    watched = served[PRUNE_AT + 6 * length + 1 : watch["step"]]
+    assert first in watched
+    assert second not in watched
 
 
 def test_with_too_few_views_the_head_stays_off(make, capsys):
-    trainer = make(5)
+    trainer = make(5, max_num_iterations=1)
     trainer.train()
     assert trainer.pipeline.model.head is None
     reason = "5 training views are too few to tell whether a head helps"
@@ -407,9 +390,9 @@ def curve(monkeypatch):
     """Fix the PSNR of the held-out views at a step; trials end without a head."""
     monkeypatch.setattr(choice, "best_head", lambda tried, folds: "plain")
 
-    def fix(decibels, held_out=2):
+    def fix(decibels):
         def quality(run):
-            assert len(list(run.heldout_views())) == held_out
+            assert len(list(run.heldout_views())) == 2
             return [HeldOutQuality(576, decibels(run.state.step), 0.5)]
 
         judged(monkeypatch, quality)
@@ -417,32 +400,35 @@ def curve(monkeypatch):
     return fix
 
 
-def watched(trainer):
-    """Collect the training views that are served, and the centres and their rate after the callbacks of each step."""
-    model, centers, rates = trainer.pipeline.model, {}, {}
+def trained(trainer):
+    """Train; the training views that are served, and the centres and their rate after the callbacks of each step."""
+    model, centers, rates, served = trainer.pipeline.model, {}, {}, served_views(trainer)
 
     def note(run):
         centers[run.state.step] = centers_of(model)
         rates[run.state.step] = run.state.schedulers["means"].lr_lambdas[0](run.state.step)
 
     after_each_step(model.train_callbacks[-1], note)
-    return served_views(trainer), centers, rates
-
-
-def test_the_field_goes_back_trains_as_long_as_was_best_and_pauses(make, curve):
-    best = DECIDED + 2 * WINDOW
-    curve(lambda step: 20 - 0.08 * abs(step - best) / WINDOW)
-    trainer = make()
-    served, centers, rates = watched(trainer)
     trainer.train()
+    return served, centers, rates
+
+
+@pytest.mark.parametrize("best", [2, 10])
+def test_the_field_goes_back_trains_as_long_as_was_best_and_pauses(make, curve, monkeypatch, best):
+    """In windows; with ten the pause is in the last steps, whose mean leaves out the weights before it."""
+    monkeypatch.setattr(averaging, "AVERAGED_EVERY", 1)
+    curve(lambda step: 20 - 0.08 * abs(step - DECIDED - best * WINDOW) / WINDOW)
+    trainer = make()
+    served, centers, rates = trained(trainer)
     # 0.08 dB below the best are 0.4% of the loss and noise, 0.16 are not.
-    back, rest = best + 2 * WINDOW, best + 2 * WINDOW + 2 * WINDOW
+    back, rest = DECIDED + (best + 2) * WINDOW, DECIDED + (2 * best + 2) * WINDOW
     record = records_of(trainer)["length"]
     held = set(record["held_out_views"])
     assert record["steps_per_measurement"] == WINDOW
-    assert [one["psnr"] for one in record["measured"]] == pytest.approx([19.92, 20, 19.92, 19.84])
-    assert record["measured"][1]["loss"] == pytest.approx(0.8 * 0.1 + 0.2 * 0.5)
-    assert record["steps_on_all_views"] == 2 * WINDOW
+    decibels = [20 - 0.08 * abs(window + 1 - best) for window in range(best + 2)]
+    assert [one["psnr"] for one in record["measured"]] == pytest.approx(decibels)
+    assert record["measured"][best - 1]["loss"] == pytest.approx(0.8 * 0.1 + 0.2 * 0.5)
+    assert record["steps_on_all_views"] == best * WINDOW
     assert torch.equal(centers[back], centers[DECIDED])
     assert not torch.equal(centers[back - 1], centers[DECIDED])
     # The rate has gone back too; it decays by 0.0006 in a window of this length.
@@ -457,39 +443,10 @@ def test_the_field_goes_back_trains_as_long_as_was_best_and_pauses(make, curve):
     assert list(trainer.checkpoint_dir.glob("*.ckpt")) == [trainer.checkpoint_dir / f"step-{STEPS - 1:09d}.ckpt"]
 
 
-def test_a_pause_in_the_last_steps_is_not_averaged(make, curve, monkeypatch):
-    """The mean at the end of a run has counted weights before the pause."""
-    monkeypatch.setattr(averaging, "AVERAGED_EVERY", 1)
-    curve(lambda step: 20 - 0.08 * abs(step - DECIDED - 10 * WINDOW) / WINDOW)
-    trainer = make()
-    _, centers, _ = watched(trainer)
-    trainer.train()
-    rest = DECIDED + 22 * WINDOW
-    assert STEPS - 10 < rest < STEPS - 1
-    assert not torch.equal(centers[rest], centers[rest - 1])
-    assert all(torch.equal(centers[rest], centers[step]) for step in range(rest, STEPS))
-
-
-def test_views_that_a_trial_has_seen_are_not_watched(make, curve):
-    """With few views a trial holds out one of two, and the Gaussians that go on have seen the other."""
-    trainer = make(8)
-    served, *_ = watched(trainer)
-    curve(lambda _: 20.0, held_out=1)
-    trainer.train()
-    (held,) = records_of(trainer)["length"]["held_out_views"]
-    other, last = records_of(trainer)["head"]["held_out_views"]
-    assert held == last
-    length = LENGTH // 2
-    assert held not in served[PRUNE_AT + length + 1 : PRUNE_AT + 2 * length + 1]  # the second trial of no head
-    # The views of the watch are those that are not held out, the seen one among them.
-    assert other in served[PRUNE_AT + 4 * length + 1 :]
-
-
 def test_a_field_that_loses_nothing_trains_to_the_end_on_all_views(make, curve):
     curve(lambda _: math.nan)
     trainer = make()
-    served, centers, _ = watched(trainer)
-    trainer.train()
+    served, centers, _ = trained(trainer)
     record, end = records_of(trainer)["length"], DECIDED + (STEPS - DECIDED) // 2
     assert len(record["measured"]) == (end - DECIDED) // WINDOW
     assert record["steps_on_all_views"] is None
@@ -504,10 +461,8 @@ def test_a_warm_start_is_not_watched(make, curve):
     curve(lambda step: 20 - step)
     trainer = make()
     trainer.pipeline.model.state.offset = PRUNE_AT
-    served = served_views(trainer)
-    trainer.train()
-    assert "head" in records_of(trainer)
-    assert "length" not in records_of(trainer)
+    served, *_ = trained(trainer)
+    assert records_of(trainer).keys() == {"head"}
     assert len(served) == STEPS
 
 
@@ -517,9 +472,7 @@ def test_a_paused_run_is_resumed_with_figures_and_trains_again_after_its_schedul
     whole = make(name="whole", steps_per_save=stop)
     whole.train()
     longer = make(name="longer", load_dir=whole.checkpoint_dir, max_num_iterations=5)
-    served = served_views(longer)
-    longer.train()
-    assert len(served) == 5
+    assert len(trained(longer)[0]) == 5
 
     def noted(name, scalar, step):
         losses.extend([float(scalar)] if name == "Train Loss" else [])
@@ -528,9 +481,8 @@ def test_a_paused_run_is_resumed_with_figures_and_trains_again_after_its_schedul
     monkeypatch.setattr(writer, "put_scalar", noted)
     monkeypatch.setattr(optimizer_configs, "LINE_EVERY", 0.0)
     resumed = make(name="resumed", load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=STEPS - stop - 1)
-    served, centers, _ = watched(resumed)
     capsys.readouterr()
-    resumed.train()
+    served, centers, _ = trained(resumed)
     assert len(served) == 1, "one image is measured, and none is trained on"
     assert all(torch.equal(centers[stop + 1], center) for center in centers.values())
     assert len(losses) == 2
@@ -544,8 +496,8 @@ def test_a_paused_run_is_resumed_with_figures_and_trains_again_after_its_schedul
 @pytest.mark.parametrize(
     ("views", "keep_ratio", "stages", "stops"),
     [
-        # Before, in trials of counts and of a head on a tenth, after the decision, and while weights are averaged.
-        (40, None, {"count", "tenth"}, (11, 45, 57, 68, 95)),
+        # Before, in trials of counts and of a head on a tenth, and after the decision.
+        (40, None, {"count", "tenth"}, (11, 45, 57, 68)),
         # Before the prune and right after it, in trials of heads, in those of the length, on all views, and paused.
         (16, 0.1, {"head", "length", "repeat", "paused"}, (37, 40, 43, 52, 61, 68, 85)),
     ],
@@ -565,19 +517,25 @@ def test_a_run_resumed_at_any_step_is_the_run(make, monkeypatch, views, keep_rat
 
     judged(monkeypatch, quality)
 
-    def run(name, **options):
+    def run(name, start, end, **options):
         pruning = PruningConfig(keep_ratio=keep_ratio, prune_at=PRUNE_AT)
-        trainer = make(views, name=name, model={"dense_start_views": 0, "pruning": pruning}, **options)
+        length = {"max_num_iterations": end - start, "schedule_length": STEPS}
+        trainer = make(views, name=name, model={"dense_start_views": 0, "pruning": pruning}, **length, **options)
         found_stages.add(trials_of(trainer.model).progress.stage)
         trainer.train()
-        path = trainer.checkpoint_dir / f"step-{STEPS - 1:09d}.ckpt"
-        return trainer, torch.load(path, map_location="cpu", weights_only=True), records_of(trainer)
+        return trainer
 
-    trainer, expected, records = run("whole", steps_per_save=1)
-    for stop in stops:
-        place = {"load_dir": trainer.checkpoint_dir, "load_step": stop, "max_num_iterations": STEPS - stop - 1}
-        _, found, again = run(f"from {stop}", **place)
-        for part in ("pipeline", "optimizers", "schedulers"):
-            same(expected[part], found[part])
-        assert again == records
+    def saved(trainer, step):
+        path = trainer.checkpoint_dir / f"step-{step:09d}.ckpt"
+        return torch.load(path, map_location="cpu", weights_only=True)
+
+    last = STEPS - 1
+    whole = run("whole", 0, STEPS, steps_per_save=1)
+    # From each stop to the next one; and while weights are averaged, whose mean ends a part too.
+    for start, end in [*zip(stops, (*stops[1:], last), strict=True), (95, last)]:
+        part = run(f"from {start}", start, end, load_dir=whole.checkpoint_dir, load_step=start)
+        expected, found = saved(whole, end), saved(part, end)
+        for part_of_state in ("pipeline", "optimizers", "schedulers"):
+            same(expected[part_of_state], found[part_of_state])
+    assert records_of(part) == records_of(whole)
     assert found_stages >= stages

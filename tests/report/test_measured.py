@@ -37,12 +37,11 @@ def test_without_a_head_full_and_base_are_the_same(measured):
 
 
 def test_a_mean_needs_all_views():
-    whole = (ViewQuality(20.0, 0.5, 0.1), ViewQuality(22.0, 0.7, 0.3))
-    assert Configuration("x", 1.0, 1, whole).mean("flip") == pytest.approx(0.2)
-    assert Configuration("x", 1.0, 1, whole).mean("lpips") is None
-    assert Configuration("x", 1.0, 1, (*whole, ViewQuality(21.0, math.nan))).mean("flip") is None
-    assert Configuration("x", 1.0, 1, (*whole, ViewQuality(21.0, math.nan))).mean("ssim") is None
-    assert Configuration("x", 1.0, 1, ()).mean("psnr") is None
+    views = (ViewQuality(20.0, 0.5, 0.1), ViewQuality(22.0, 0.7, 0.3), ViewQuality(21.0, math.nan))
+    missing = ((2, "lpips"), (3, "flip"), (3, "ssim"), (0, "psnr"))
+    for count, metric, mean in ((2, "flip", 0.2), *((*case, None) for case in missing)):
+        found = Configuration("x", 1.0, 1, views[:count]).mean(metric)
+        assert found == (None if mean is None else pytest.approx(mean)), metric
 
 
 def test_the_net_is_named_only_if_lpips_was_measured(measured):
@@ -98,12 +97,8 @@ def test_the_record_of_trials_is_read_or_refused_in_one_line(tmp_path):
     path = tmp_path / "trials.json"
     path.write_text(json.dumps({"count": COUNT}))
     assert read_count_curve(tmp_path) == CountCurve(240, 1000, COUNT["reason"], (CurvePoint(**POINT),))
-    damaged = [
-        {**COUNT, "chosen": "many"},
-        {**COUNT, "curve": [{"count": 3}]},
-        {**COUNT, "curve": [{**POINT, "psnr": "x"}]},
-    ]
-    for content in ("", "[]", *(json.dumps({"count": each}) for each in damaged)):
+    wrong = ({"chosen": "many"}, {"curve": [{"count": 3}]}, {"curve": [{**POINT, "psnr": "x"}]})
+    for content in ("", "[]", *(json.dumps({"count": {**COUNT, **each}}) for each in wrong)):
         path.write_text(content)
         with pytest.raises(CheckpointError, match=r"trials\.json cannot be read .*; remove it, or train the run again"):
             read_count_curve(tmp_path)

@@ -31,15 +31,9 @@ from sundae_ns.train.curve import CountCurve, CurvePoint
 
 HOSTILE = """"'></h4><script>window.harmed = 1</script><img src=x onerror='window.harmed = 1'>{{ 7*7 }}&amp;"""
 VOID = {"meta", "img", "input", "br", "link"}
-CURVE = CountCurve(
-    chosen=3000,
-    full=9000,
-    reason=f"the smallest within 0.1 dB {HOSTILE}",
-    points=tuple(
-        CurvePoint(count, None, 26 - loss, 0.9 - loss / 20, loss, loss / 20, 0.05, 0.001)
-        for count, loss in ((9000, 0.0), (3000, 0.1), (1000, 1.0))
-    ),
-)
+LOSSES = {9000: 0.0, 3000: 0.1, 1000: 1.0}
+POINTS = (CurvePoint(n, None, 26 - loss, 0.9 - loss / 20, loss, loss / 20, 0.05, 0.001) for n, loss in LOSSES.items())
+CURVE = CountCurve(3000, 9000, f"the smallest within 0.1 dB {HOSTILE}", tuple(POINTS))
 
 
 class Page(HTMLParser):
@@ -47,9 +41,7 @@ class Page(HTMLParser):
 
     def __init__(self, text):
         super().__init__()
-        self.elements = []
-        self.open = []
-        self.text = []
+        self.elements, self.open, self.text = [], [], []
         self.feed(text)
         self.close()
         assert self.open == []
@@ -59,9 +51,6 @@ class Page(HTMLParser):
         self.elements.append((tag, dict(attrs)))
         if tag not in VOID:
             self.open.append(tag)
-
-    def handle_startendtag(self, tag, attrs):
-        self.elements.append((tag, dict(attrs)))
 
     def handle_endtag(self, tag):
         assert self.open.pop() == tag
@@ -93,9 +82,10 @@ def images(seed=0, height=24, width=32):
 
 
 def shown(run, *, name="", **options):
-    bases = run.base.views if run.has_head else [None] * len(run.full.views)
-    pairs = enumerate(zip(run.full.views, bases, strict=True))
-    views = [shown_view(i, f"{i}{name}", *layers(*images(i), head=pair[1]), *pair) for i, pair in pairs]
+    views = []
+    for i, view in enumerate(run.full.views):
+        base = run.base.views[i] if run.has_head else None
+        views.append(shown_view(i, f"{i}{name}", *layers(*images(i), head=base is not None), view, base))
     return ShownRun(run, views, **options)
 
 
@@ -114,15 +104,11 @@ def text(measured):
     return page_of(shown(measured(), curve=CURVE), shown(measured("b", head=False)))
 
 
-# ------------------------------------------------------------------------------------------------- the choice of views
-
-
-@pytest.mark.parametrize("count", [1, 2, 5, 23, 24, 25, 300, 1000])
-def test_the_worst_and_the_best_view_are_among_those_that_are_shown(count):
-    random = np.random.default_rng(count)
-    for _ in range(20):
-        qualities = random.uniform(10, 40, count).tolist()
+def test_the_worst_and_the_best_view_are_among_those_that_are_shown():
+    random = np.random.default_rng(0)
+    for count in (1, 2, 5, 23, 24, 25, 300, 1000):
         for most in (2, 3, 7, MOST_VIEWS):
+            qualities = random.uniform(10, 40, count).tolist()
             chosen = choose_cameras(qualities, most)
             assert len(chosen) == min(most, count)
             assert chosen == sorted(set(chosen))
@@ -135,9 +121,6 @@ def test_other_views_are_evenly_spaced_between_them():
     assert set(np.diff(ranks)) == {13.0}
     qualities[31] = math.nan  # counts as worst
     assert choose_cameras(qualities, 2) == [31, qualities.index(299.0)]
-
-
-# ------------------------------------------------------------------------------------------------------- the error map
 
 
 def test_errors_have_their_place_among_the_colors():
@@ -169,9 +152,6 @@ def test_an_error_map_needs_two_images_of_one_size():
             error_map(torch.zeros(shape), torch.zeros(8, 8, shape[-1]))
 
 
-# ------------------------------------------------------------------------------------------------------------ one view
-
-
 @pytest.mark.parametrize("head", [True, False])
 @pytest.mark.parametrize(
     ("size", "expected"),
@@ -200,9 +180,6 @@ def test_a_rendering_that_is_not_finite_is_shown(measured):
     assert np.asarray(decoded(view.images["rendering"])).max() == 0
     errors = np.asarray(decoded(view.images["error map"]).convert("RGB"))
     assert np.array_equal(np.unique(errors), np.unique(ERROR_COLORS[-1]))
-
-
-# ------------------------------------------------------------------------------------------------------------ the page
 
 
 def outside(text):
@@ -249,6 +226,7 @@ def test_its_figures_are_those_of_the_report(measured):
     assert [float(card["data-psnr"]) for card in page.all("article")] == [view.psnr for view in run.full.views]
     assert "sundae compare x" in page.words
     assert "All 3 views" in page.words
+    assert "2 of 3 views" in Page(page_of(replace(shown(run), views=shown(run).views[:2]))).words
 
 
 def test_hostile_names_stay_text(measured):
@@ -280,7 +258,8 @@ def test_views_of_other_runs_stand_beside_those_of_the_same_capture(measured):
     assert choices == [*places[3:], *places[:3]] == ["v1-0", "v1-1", "v1-2", "v0-0", "v0-1", "v0-2"]
 
 
-# --------------------------------------------------------------------------------------------------------- in a browser
+def in_browser(test):
+    return pytest.mark.browser(needs_chromium(test))
 
 
 @pytest.fixture
@@ -313,8 +292,7 @@ def place(page):
 CLIP = "getComputedStyle(card.querySelector('.over:not([hidden])')).clipPath"
 
 
-@pytest.mark.browser
-@needs_chromium
+@in_browser
 def test_keys_and_pointer_move_the_slider(opened):
     assert of_first(opened, CLIP) == "inset(0px 0px 0px 50%)"
     of_first(opened, "card.querySelector('input[type=range]').focus()")
@@ -333,8 +311,7 @@ def test_keys_and_pointer_move_the_slider(opened):
     assert opened.evaluate("document.documentElement.scrollWidth") == 400
 
 
-@pytest.mark.browser
-@needs_chromium
+@in_browser
 def test_a_finger_moves_the_slider_or_scrolls_the_page(opened):
     x, y, width, height = place(opened)
     value, scrolled = "card.querySelector('input[type=range]').value", "window.scrollY"
@@ -347,8 +324,7 @@ def test_a_finger_moves_the_slider_or_scrolls_the_page(opened):
     assert of_first(opened, value) == "80"
 
 
-@pytest.mark.browser
-@needs_chromium
+@in_browser
 def test_layers_order_and_the_other_run(opened):
     drawn = "[...card.querySelectorAll('.over:not([hidden])')].map(e => e.dataset.layer).join()"
     assert of_first(opened, drawn) == "rendering"

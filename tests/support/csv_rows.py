@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import ast
 import csv
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,7 +16,7 @@ def read_rows(path: Path) -> list[SimpleNamespace]:
 
 
 def _value(cell: str) -> Any:
-    try:
-        return ast.literal_eval(cell) if cell else None
-    except (SyntaxError, ValueError):
-        return cell
+    for kind in (int, float):
+        with suppress(ValueError):
+            return kind(cell)
+    return cell or None

@@ -6,7 +6,7 @@ import hashlib
 import json
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from documents import put
 from fields import random_field
 from torch import Tensor
 
+from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.head.head import CompensationHead, HeadConfig
 from sundae_ns.io.pack import container
 from sundae_ns.io.pack.codecs import Sensitivity
@@ -22,7 +23,8 @@ from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.io.pack.packed_scene import PackedScene, write_scene
 from sundae_ns.scene.initialization import from_points
 from sundae_ns.scene.load_save import load
-from sundae_ns.scene.scene import Scene
+from sundae_ns.scene.packing import contents_of
+from sundae_ns.scene.scene import Background, Scene
 
 WIDTH, HEIGHT = 50, 37
 FOCAL = 45.0
@@ -35,7 +37,7 @@ class Kind:
     points: int = 400
     degree: int = 3
     antialiased: bool = False
-    background: str = "random"
+    background: Background = "random"
     head: HeadConfig | None = None
     focal: float | None = FOCAL
     """Focal length that the head was trained at; None if unknown."""
@@ -62,17 +64,8 @@ KINDS = {
     "many Gaussians": Kind(points=20_000, degree=0, head=_head("residual", 1, 1)),
     "other precisions": Kind(
         head=_head("residual", 1, 6),
-        config=PackConfig(
-            block=64,
-            position_bits=16,
-            scale_step=0.001,
-            rotation_step=0.0001,
-            color_step=0.0001,
-            opacity_step=0.001,
-            harmonics_step=0.0001,
-            feature_step=1.0,
-            head_step=0.008,
-        ),
+        # Steps in the order of STEPS.
+        config=PackConfig(16, 64, 0.001, 0.0001, 0.0001, 0.001, 0.0001, 1.0, 0.008),
     ),
 }
 
@@ -91,26 +84,19 @@ def write_kind(path: Path, kind: Kind) -> Path:
     # From specks below a pixel to a fifth of the image.
     gaussians["scales"] += 1.5 * torch.randn(n, 3) + (1.5 if n > 1000 else -0.5)
     gaussians["opacities"] = 3 * torch.randn(n, 1) + 1
-    head: dict[str, Tensor] = {}
-    stated = None
+    head = None
     if kind.head is None:
         gaussians.pop("features")
     else:
-        head = {name: value.detach() for name, value in CompensationHead(kind.head).state_dict().items()}
+        head = CompensationHead(kind.head)
         if kind.head.mode == "residual":
             # The last layer starts at zero.
-            head["net.out.weight"] = 0.3 * torch.randn_like(head["net.out.weight"])
-        names = ("mode", "size", "pixel_unshuffle", "num_features", "precision")
-        stated = {name: getattr(kind.head, name) for name in names}
-    model = {
-        "sh_degree": kind.degree,
-        "rasterize_mode": "antialiased" if kind.antialiased else "classic",
-        "background_color": kind.background,
-        "head": stated,
-        "trained_focal": [kind.focal, kind.focal] if stated and kind.focal else None,
-    }
-    sensitivity = _sensitivity(gaussians, head) if kind.measured else None
-    write_scene(path, PackedScene(gaussians, head, _cameras(), {"model": model}, sensitivity), kind.config)
+            head.net.out.weight.data = 0.3 * torch.randn_like(head.net.out.weight)
+    focal = (kind.focal, kind.focal) if kind.head and kind.focal else None
+    encoded = Gaussians(gaussians, "harmonics" if kind.degree else "logits")
+    packed = contents_of(Scene(encoded, head, kind.background, kind.antialiased, focal, in_model_frame=True))
+    sensitivity = _sensitivity(gaussians, packed.head) if kind.measured else None
+    write_scene(path, replace(packed, cameras=_cameras(), sensitivity=sensitivity), kind.config)
     return path
 
 

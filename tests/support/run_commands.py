@@ -15,7 +15,7 @@ import pytest
 import torch
 import tyro
 from nerfstudio.engine.trainer import TrainerConfig
-from PIL import Image
+from photos import photo
 
 from sundae_ns import method_configs
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
@@ -117,10 +117,6 @@ def packed() -> bytes:
     model = {"sh_degree": 0, "rasterize_mode": "classic", "background_color": "black"}
     scene = PackedScene(from_points(points, points, sh_degree=0, num_features=0), meta={"model": model})
     return pack_bytes(*fit_scene(scene))[0]
-
-
-def photo(path: Path, kind: str = "jpeg") -> None:
-    Image.new("RGB", (16, 12), "grey").save(path, format=kind)
 
 
 def run(*words: str) -> int:

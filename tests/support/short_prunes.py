@@ -25,6 +25,6 @@ def short_prunes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def short_distillation(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Distillation and levels of detail by few small views, and levels by two steps."""
-    for name, value in {"LEVEL_STEPS": {"cpu": 2}, "CAMERAS": 8, "SIDES": {"cpu": 32}}.items():
+    """Distillation and levels of detail by few small views and few steps."""
+    for name, value in {"STEPS": {"cpu": 4}, "LEVEL_STEPS": {"cpu": 2}, "CAMERAS": 8, "SIDES": {"cpu": 32}}.items():
         monkeypatch.setattr(f"sundae_ns.plugin.distill.{name}", value)

@@ -1,4 +1,4 @@
-"""Views and points of captures of few training views; ``lab/cut.py`` writes them.
+"""Views and points of captures of few training views; ``cut.py`` writes them.
 
 Points are those that structure from motion of the training photos finds: of the capture's own, those that two of them
 see; where these have no tracks, by pycolmap from the capture's poses.
