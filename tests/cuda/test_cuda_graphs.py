@@ -2,6 +2,7 @@
 
 import gc
 from contextlib import contextmanager, nullcontext, suppress
+from functools import partial
 from unittest import mock
 
 import pytest
@@ -12,25 +13,12 @@ from sundae_ns.cuda import cuda_graphs
 from sundae_ns.cuda.cuda_graphs import MAX_GRAPHS, RECORD_AT, GraphCache, record, warm_up
 
 
-@pytest.fixture
-def eager_collector():
-    """Run the garbage collector at almost every allocation."""
-    before = gc.get_threshold()
-    gc.set_threshold(1, 1, 1)
-    yield
-    gc.set_threshold(*before)
-
-
 def test_a_key_repeated_in_a_row_is_recorded_once():
     cache = GraphCache()
     made = []
 
     def get(key):
-        def make():
-            made.append(key)
-            return f"graph of {key}"
-
-        return cache.get(key, make)
+        return cache.get(key, lambda: made.append(key) or f"graph of {key}")
 
     for key in "abababab":
         assert get(key) is None
@@ -117,7 +105,9 @@ def test_a_failed_recording_restores_stream_and_generator(monkeypatch):
 
 
 @pytest.mark.gpu
-def test_a_graph_in_the_garbage_does_not_break_a_recording(eager_collector):
+def test_a_graph_in_the_garbage_does_not_break_a_recording(request):
+    request.addfinalizer(partial(gc.set_threshold, *gc.get_threshold()))
+    gc.set_threshold(1, 1, 1)  # collect at almost every allocation
     device, values = torch.device("cuda"), torch.arange(8.0, device="cuda")
 
     def plus(summand):

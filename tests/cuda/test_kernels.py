@@ -39,7 +39,6 @@ def test_missing_kernels_are_reported_once(caplog):
 
 
 def test_adam_follows_torch():
-    """Over gradients of all sizes, with vanishing ones, and with a rate that changes."""
     n, betas = 1000, (0.9, 0.999)
     value = torch.randn(n)
     exact = torch.nn.Parameter(value.double())

@@ -69,7 +69,6 @@ VALUES = (
 
 
 def places(value):
-    """Every container of a parsed file, paired with each of its keys."""
     keys = value.keys() if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ()
     return [(value, key) for key in keys] + [place for key in keys for place in places(value[key])]
 

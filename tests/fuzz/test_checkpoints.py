@@ -31,9 +31,7 @@ class Pipeline(torch.nn.Module):
         outputs = SimpleNamespace(dataparser_transform=torch.eye(4)[:3], dataparser_scale=1.0)
         self.datamanager = SimpleNamespace(train_dataparser_outputs=outputs)
 
-    @property
-    def model(self):
-        return self._model
+    model = property(lambda self: self._model)
 
     def load_pipeline(self, state, step):
         self._model.load_state_dict({name.removeprefix("_model."): value for name, value in state.items()})

@@ -95,19 +95,19 @@ def test_full_disk(tmp_path, name):
 
 
 @pytest.mark.parametrize(
-    ("number", "reason"),
-    [(errno.ENOSPC, "the disk is full; make room$"), (errno.EROFS, ".*read-only"), (errno.EACCES, "permission denied")],
+    ("error", "kind", "message"),
+    [
+        (OSError(errno.ENOSPC, "no"), StorageError, "cannot make a: the disk is full; make room$"),
+        (OSError(errno.EROFS, "no"), StorageError, "cannot make a: .*read-only"),
+        (OSError(errno.EACCES, "no"), StorageError, "cannot make a: permission denied"),
+        (OSError(errno.EMFILE, "too many open files"), OSError, r"\[Errno \d+\] too many open files"),
+        (StorageError("cannot write b: denied"), StorageError, "cannot write b: denied$"),
+    ],
 )
-def test_system_errors_become_one_line(number, reason):
-    with pytest.raises(StorageError, match=f"^cannot make a: {reason}"), writing("cannot make a"):
-        raise OSError(number, "no")
-
-
-def test_only_errors_that_a_user_can_correct_are_converted():
-    for error in (StorageError("cannot write b: denied"), OSError(errno.EMFILE, "too many open files")):
-        with pytest.raises(OSError, match=str(error.args[-1])) as caught, writing("cannot make a"):
-            raise error
-        assert caught.value is error
+def test_errors_that_a_user_can_correct_are_one_line(error, kind, message):
+    with pytest.raises(OSError, match=f"^{message}") as caught, writing("cannot make a"):
+        raise error
+    assert type(caught.value) is kind
 
 
 def test_a_full_disk_is_found_behind_the_error_that_replaces_it(tmp_path):

@@ -23,7 +23,7 @@ from limits import refused
 
 import sundae_ns as sn
 from sundae_ns.core.gaussians import SH_C0, SPLAT_NAMES
-from sundae_ns.io.formats import read_gaussian_file, unread
+from sundae_ns.io.formats import read_gaussian_file
 from sundae_ns.io.splat import read_ksplat
 
 
@@ -139,14 +139,6 @@ def test_damaged_files_are_refused_in_one_line(tmp_path, monkeypatch, kind):
     write(tmp_path / name)
     refused(read_gaussian_file, tmp_path / name, words)
     assert not (tmp_path / "harm").exists()
-
-
-def test_folders_of_3dgs_name_their_file(tmp_path):
-    last = tmp_path / "point_cloud" / "iteration_30000" / "point_cloud.ply"
-    last.parent.mkdir(parents=True)
-    last.touch()
-    assert unread(tmp_path) == f"is a folder of 3DGS; give {last}"
-    assert unread(tmp_path / "point_cloud") is None
 
 
 SECTION = 4096  # offset of the first section's header
