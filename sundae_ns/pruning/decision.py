@@ -136,9 +136,8 @@ class Pruner:
     def drop_nonfinite(self) -> int:
         """Remove Gaussians that are not finite, clamp others (``sanitise``); returns how many went.
 
-        ``DataError`` if all would.
-
-        Call it before the contribution, which renders the field: one NaN spreads over the image.
+        Call it before the contribution, which renders the field: one NaN spreads over the image. ``DataError`` if all
+        would go.
         """
         sanitised = sanitise(self.params)
         if not sanitised.gaussians.num_gaussians:

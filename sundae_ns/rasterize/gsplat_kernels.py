@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from sundae_ns.core.errors import SundaeError
 from sundae_ns.cuda.kernels import Argument, load_kernels
 from sundae_ns.rasterize.reference import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 
@@ -137,10 +137,8 @@ class _Blend(torch.autograd.Function):
         return image, alphas
 
     @staticmethod
-    def backward(  # type: ignore[override]
-        ctx: Any, grad_image: Tensor, grad_alphas: Tensor
-    ) -> tuple[Tensor | None, ...]:
-        _refuse_second_derivative("this blending has")
+    @once_differentiable
+    def backward(ctx: Any, grad_image: Tensor, grad_alphas: Tensor) -> tuple[Tensor | None, ...]:
         centers, *saved = ctx.saved_tensors
         grads = [torch.zeros_like(value) for value in saved[:4]]
         absolute = torch.zeros_like(saved[0]) if ctx.absgrad else None
@@ -158,12 +156,6 @@ It takes centres ``[1, N, 2]`` in pixels, conics ``[1, N, 3]``, colours ``[1, N,
 lists, and ``absgrad``, all on a CUDA device. Lists of tiles outside the image are ignored. With ``absgrad`` the
 backward pass sets that of the centres, as :func:`sundae_ns.rasterize.reference.composite` does.
 """
-
-
-def _refuse_second_derivative(what: str) -> None:
-    """Refuse ``create_graph=True``: the kernel would be missing from that graph."""
-    if torch.is_grad_enabled():
-        raise SundaeError(f"{what} no second derivative; use the reference rasteriser")
 
 
 # ------------------------------------------------------------------------------------------------------------- colours
@@ -188,8 +180,8 @@ class _Colors(torch.autograd.Function):
         return colors
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        _refuse_second_derivative("these harmonics have")
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         means, center, dc, rest, colors = ctx.saved_tensors
         grads = [torch.empty_like(value) for value in (means, dc, rest)]
         threads = -(-len(means) // _PER_BLOCK) * _PER_BLOCK

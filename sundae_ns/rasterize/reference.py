@@ -48,8 +48,8 @@ class ReferenceBackend:
         projection = project(inputs)
         opacities, colors = blended_values(inputs, projection)
         means2d = projection.means2d[None]
-        width, height = inputs.camera.width, inputs.camera.height
-        image, alpha = composite(means2d, projection, opacities, colors, width, height, absgrad=inputs.absgrad)
+        size = inputs.camera.width, inputs.camera.height
+        image, alpha = composite(means2d, projection, opacities, colors, size, absgrad=inputs.absgrad)
         return result_of(image, alpha, means2d, projection.radii, inputs)
 
     def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
@@ -134,21 +134,15 @@ def blended_values(inputs: Inputs, projection: Projection) -> tuple[Tensor, Tens
 
 
 def composite(
-    means2d: Tensor,
-    projection: Projection,
-    opacities: Tensor,
-    colors: Tensor,
-    width: int,
-    height: int,
-    *,
-    absgrad: bool,
+    means2d: Tensor, projection: Projection, opacities: Tensor, colors: Tensor, size: tuple[int, int], *, absgrad: bool
 ) -> tuple[Tensor, Tensor]:
     """Blend opacities ``[N]`` and channels ``[N, C]`` to an image ``[H, W, C]`` and its alpha ``[H, W, 1]``.
 
-    ``means2d`` are centres in pixels ``[1, N, 2]``. With ``absgrad`` the backward pass sets their ``absgrad`` ``[1, N,
-    2]``: absolute gradients of each pixel with respect to the centre, summed (Ye et al., "AbsGS", 2024).
+    ``means2d`` are centres in pixels ``[1, N, 2]``, ``size`` is width and height. With ``absgrad`` the backward pass
+    sets their ``absgrad`` ``[1, N, 2]``: absolute gradients of each pixel by the centre, summed (Ye et al., 2024).
     ``MemoryExhaustedError`` if a CPU's lists of tiles are too long.
     """
+    width, height = size
     columns, rows = -(-width // BIN), -(-height // BIN)
     drawn = (projection.radii > 0) & (opacities >= MIN_ALPHA) & projection.conics.isfinite().all(dim=1)
     ids = drawn.nonzero()[:, 0]

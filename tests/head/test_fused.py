@@ -59,24 +59,18 @@ def test_overflowing_pixels_are_not_corrected():
     assert torch.equal(out[3, 4], base[3, 4])
 
 
-def layer_gradients(head, images, grad_out):
-    """The image, and gradients of splatted values, accumulation and parameters, by autograd."""
+def gradients(head, images, grad_out, *, kernels=False):
+    """The image, and gradients of splatted values, accumulation and parameters, by the layers or by the kernels."""
     base, *leaves = images[0], *(image.clone().requires_grad_() for image in images[1:])
     head.zero_grad()
-    out = head(base, *leaves)
+    if kernels:
+        residual = head.config.mode == "residual"
+        out = fused.correction(head.net, residual, *leaves, torch.float32) + (base if residual else 0)
+    else:
+        out = head(base, *leaves)
     (out * grad_out).sum().backward()
     grads = [leaf.grad if leaf.grad is not None else torch.zeros_like(leaf) for leaf in leaves]
     return [out.detach(), *grads, *(p.grad.clone() for p in head.parameters() if p.grad is not None)]
-
-
-def kernel_gradients(head, images, grad_out):
-    base, *leaves = images[0], *(image.clone().requires_grad_() for image in images[1:])
-    head.zero_grad()
-    residual = head.config.mode == "residual"
-    out = fused.correction(head.net, residual, *leaves, torch.float32)
-    out = base + out if residual else out
-    (out * grad_out).sum().backward()
-    return [out.detach(), *(leaf.grad for leaf in leaves), *(p.grad.clone() for p in head.parameters())]
 
 
 KINDS = [{"mode": mode, "pixel_unshuffle": fold} for mode in ("residual", "features") for fold in (1, 2, 3, 4)]
@@ -88,7 +82,7 @@ def test_same_image_and_gradients(options, workers, monkeypatch):
     """Also where few threads sum over the pixels."""
     monkeypatch.setattr(fused, "MOST_WORKERS", workers)
     head, images, grad_out = make(**options), splatted(37, 50, 5), torch.randn(37, 50, 3)
-    both = kernel_gradients(head, images, grad_out), layer_gradients(head, images, grad_out)
+    both = gradients(head, images, grad_out, kernels=True), gradients(head, images, grad_out)
     torch.testing.assert_close(by_kernels(head, images), both[1][0], rtol=1e-4, atol=1e-5)
     for found, expected in zip(*both, strict=True):
         torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-5 * max(1.0, float(expected.abs().max())))
@@ -99,7 +93,7 @@ def test_same_image_and_gradients_at_any_size(height, width, num_features, seed)
     head = make(num_features=num_features)
     images, grad_out = splatted(height, width, num_features, seed=seed), torch.randn(height, width, 3)
     torch.testing.assert_close(by_kernels(head, images), head(*images).detach(), rtol=1e-4, atol=1e-5)
-    both = kernel_gradients(head, images, grad_out), layer_gradients(head, images, grad_out)
+    both = gradients(head, images, grad_out, kernels=True), gradients(head, images, grad_out)
     for found, expected in zip(*both, strict=True):
         # Compare norms: some image has an activation so near zero that rounding decides its slope.
         assert float((found - expected).norm()) <= 2e-3 * max(float(expected.norm()), 1e-3)
@@ -165,7 +159,7 @@ def test_training_on_a_gpu_matches_the_layers(mode):
             head.load_state_dict(exact.state_dict())
         images = tuple(image.cuda() for image in splatted(height, width, 13, seed=seed))
         grad_out = torch.randn(height, width, 3, device="cuda")
-        results = (layer_gradients(head, images, grad_out) for head in (quick, layers, exact))
+        results = (gradients(head, images, grad_out) for head in (quick, layers, exact))
         by_result = [[found - whole, rounded - whole, whole] for found, rounded, whole in zip(*results, strict=True)]
         norms.append(torch.tensor([[float(value.norm()) for value in values] for values in by_result]))
         assert quick._can_fuse
@@ -184,7 +178,7 @@ def test_gradients_of_several_images_add_up_on_a_gpu():
     parts, sizes = [], [(33, 40), (48, 64), (33, 40), (33, 40)]
     shown = [tuple(image.cuda() for image in splatted(*size, 13, seed=n)) for n, size in enumerate(sizes)]
     for images in shown:
-        parts.append(layer_gradients(head, images, torch.ones(3, device="cuda"))[3:])
+        parts.append(gradients(head, images, torch.ones(3, device="cuda"))[3:])
     head.zero_grad()
     for base, *leaves in shown:
         head(base, *(leaf.clone().requires_grad_() for leaf in leaves)).sum().backward()

@@ -7,7 +7,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sundae_ns.core.errors import SundaeError
 from sundae_ns.rasterize import gsplat_backend, gsplat_kernels, interface
 from sundae_ns.rasterize.gsplat_backend import RecordableGsplat
 from sundae_ns.rasterize.gsplat_kernels import TILE, Capacity, GsplatLists, Splats, blend, tile_lists
@@ -30,17 +29,6 @@ def test_kernels_compile_for_gpus(compile_for_gpu, monkeypatch):
     compile_for_gpu("colors.cu", "sm_90", gsplat_kernels.COLOR_OPTIONS)
     for architecture, channels, absgrad in (("sm_75", 3, True), ("sm_90", 16, False), ("sm_90", 32, False)):
         compile_for_gpu("blending.cu", architecture, gsplat_kernels.blending_options(channels, absgrad=absgrad))
-
-
-def test_second_derivatives_are_refused():
-    primitives = ellipses(5, 20, 20, largest=2.0)
-    leaves = leaves_of(primitives, torch.float32)
-    image, _ = blend(*leaves.values(), every_tile(primitives, 20, 20, spare=0), False)
-    means, center, dc, rest = colors_inputs()
-    colors = gsplat_kernels.harmonic_colors(1, means.requires_grad_(), center, dc, rest)
-    for value, leaf in ((image, leaves["means2d"]), (colors, means)):
-        with pytest.raises(SundaeError, match="second derivative"):
-            torch.autograd.grad(value.sum(), leaf, create_graph=True)
 
 
 # --------------------------------------------------------------------------------------------------------------- tiles
@@ -223,7 +211,7 @@ def expected(primitives, leaves, width, height, absgrad):
     conics, depths = leaves["conics"][0], primitives["depths"]
     projection = Projection(primitives["means2d"], covariances, conics, depths, compensations, radii)
     blended = leaves["opacities"][0], leaves["colors"][0]
-    return composite(leaves["means2d"], projection, *blended, width, height, absgrad=absgrad)
+    return composite(leaves["means2d"], projection, *blended, (width, height), absgrad=absgrad)
 
 
 def leaves_of(primitives, dtype):

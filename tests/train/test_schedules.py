@@ -13,24 +13,9 @@ from torch.optim.lr_scheduler import ExponentialLR
 from sundae_ns.core.errors import ConfigError
 from sundae_ns.head.head import CompensationHead, HeadConfig
 from sundae_ns.plugin.optimizer_configs import FusedAdamConfig, NetworkAdamConfig, PruneAwareDecayConfig
+from sundae_ns.train import schedules
 from sundae_ns.train.pruning import UNPRUNED
-from sundae_ns.train.schedules import (
-    LEAST_IMAGES,
-    MOST_FACTOR,
-    SPARSE,
-    Decay,
-    fit_to_length,
-    given_options,
-    limit_rise,
-    notify_pruned,
-    option,
-    put_restarts,
-    restarts,
-    schedule_table,
-    set_option,
-    step_options,
-    take_options,
-)
+from sundae_ns.train.schedules import SPARSE, Decay, fit_to_length, given_options, notify_pruned, option
 
 OURS = sorted(name for name in all_methods if name.startswith("sundae"))
 
@@ -62,7 +47,7 @@ def test_every_option_follows_and_once_is_enough(method, share):
     usual = all_methods[method]
     config = fitted(method, round(share * usual.max_num_iterations))
     kept_apart = ("refine_every", "reset_alpha_every", "warmup_steps")
-    for name in step_options(usual):
+    for name in schedules.step_options(usual):
         if name.endswith(kept_apart):
             continue
         found, value = option(config, name), option(usual, name)
@@ -83,9 +68,9 @@ def test_a_twentieth_of_the_steps():
     assert (model.stop_split_at, model.sh_degree_interval) == (600, 50)
     assert {parts["scheduler"].max_steps for parts in config.optimizers.values() if parts["scheduler"]} == {1500}
     # Densification needs images for its statistics, and opacities need time to recover.
-    assert model.refine_every == LEAST_IMAGES
+    assert model.refine_every == schedules.LEAST_IMAGES
     assert model.reset_alpha_every * model.refine_every > model.stop_split_at
-    assert dict(schedule_table(config)) == {
+    assert dict(schedules.schedule_table(config)) == {
         "images": "1/4 until 150, 1/2 until 300, then full size",
         "densification": "25 to 600, every 50; opacities never reset",
         "SH degree": "+1 every 50 steps",
@@ -96,7 +81,7 @@ def test_a_twentieth_of_the_steps():
 
 
 def test_resets_keep_their_share_of_a_run_that_has_time_for_them():
-    resets = dict(schedule_table(fitted("sundae", 15000)))["densification"]
+    resets = dict(schedules.schedule_table(fitted("sundae", 15000)))["densification"]
     assert resets == "250 to 6,000, every 50; opacities reset every 1,500"
 
 
@@ -126,7 +111,7 @@ def test_a_resumed_run_keeps_its_schedule():
     config.pipeline.model.sh_degree_interval = 9
     run.pipeline.model.head.size, run.pipeline.model.pruning.keep_ratio = "tiny", 0.3
     config.pipeline.model.pruning.keep_ratio = 0.2
-    lines = take_options(config, run, usual, given_options(["--pipeline.model.pruning.prune-at", "4000"]))
+    lines = schedules.take_options(config, run, usual, given_options(["--pipeline.model.pruning.prune-at", "4000"]))
     assert config.pipeline.model.head.size == "tiny"
     assert lines == [
         "--pipeline.model.sh-degree-interval is 9; the run to resume has 200",
@@ -147,11 +132,11 @@ FIXED = [MODEL + name for name in ("sh_degree", "head.size", "head.num_features"
 def test_options_that_a_checkpoint_cannot_follow_are_refused(name):
     """Its shapes, and the options of its schedulers, which lie in their states."""
     run, usual = fitted("sundae", 6000), deepcopy(all_methods["sundae"])
-    set_option(run, name, "tiny" if name.endswith("size") else 1)
+    schedules.set_option(run, name, "tiny" if name.endswith("size") else 1)
     given = given_options([f"--{name.replace('_', '-')}"])
     with pytest.raises(ConfigError, match=r"the run to resume has (tiny|1), which cannot change; leave the option out"):
-        take_options(deepcopy(usual), run, usual, given)
-    take_options(deepcopy(usual), run, usual, given_options([]))
+        schedules.take_options(deepcopy(usual), run, usual, given)
+    schedules.take_options(deepcopy(usual), run, usual, given_options([]))
 
 
 @pytest.mark.parametrize(
@@ -172,15 +157,13 @@ def test_options_that_a_checkpoint_cannot_follow_are_refused(name):
 def test_tables_of_other_kinds(method, changed, expected):
     config = deepcopy(all_methods[method])
     for name, value in changed.items():
-        set_option(config, MODEL + name, value)
-    assert expected.items() <= dict(schedule_table(config)).items()
+        schedules.set_option(config, MODEL + name, value)
+    assert expected.items() <= dict(schedules.schedule_table(config)).items()
 
 
-def scheduler(**options):
-    config = PruneAwareDecayConfig(lr_final=1e-4, max_steps=100, **options)
-    optimizer = Adam([torch.nn.Parameter(torch.zeros(1))], lr=1e-2)
-    made = config.setup().get_scheduler(optimizer, lr_init=1e-2)
-    return made
+def scheduler(optimizer=None, **options):
+    optimizer = optimizer or Adam([torch.nn.Parameter(torch.zeros(1))], lr=1e-2)
+    return PruneAwareDecayConfig(lr_final=1e-4, max_steps=100, **options).setup().get_scheduler(optimizer, lr_init=1e-2)
 
 
 def rates(made, steps, prune_at=None, *, name="means", primitives=SPARSE):
@@ -215,7 +198,8 @@ def test_from_first_to_last(shape, middle):
 
 
 @pytest.mark.parametrize(
-    ("primitives", "factor"), [(10 * SPARSE, 1), (SPARSE, 1), (SPARSE // 4, 2), (SPARSE // 9, 3), (1, MOST_FACTOR)]
+    ("primitives", "factor"),
+    [(10 * SPARSE, 1), (SPARSE, 1), (SPARSE // 4, 2), (SPARSE // 9, 3), (1, schedules.MOST_FACTOR)],
 )
 def test_centres_of_few_primitives_move_faster_after_the_prune(primitives, factor):
     usual = rates(scheduler(lr_restart=4e-3), 130, prune_at=40)
@@ -246,29 +230,25 @@ def test_only_the_first_prune_counts_and_others_are_left_alone():
 
 def head_scheduler():
     """Of a network with weights, which decay, and biases: two groups, and torch lists a multiplier for each."""
-    optimizer = NetworkAdamConfig(lr=1e-2, weight_decay=0.1).setup(
-        [torch.nn.Parameter(torch.zeros(2, 2)), torch.zeros(1)]
-    )
-    config = PruneAwareDecayConfig(
-        lr_final=1e-4, max_steps=100, lr_restart=1e-2, hold_until_prune=True, warmup_steps=9, shape="cosine"
-    )
-    made = config.setup().get_scheduler(optimizer, lr_init=1e-2)
+    parameters = [torch.nn.Parameter(torch.zeros(2, 2)), torch.zeros(1)]
+    optimizer = NetworkAdamConfig(lr=1e-2, weight_decay=0.1).setup(parameters)
+    made = scheduler(optimizer, lr_restart=1e-2, hold_until_prune=True, warmup_steps=9, shape="cosine")
     assert len(made.lr_lambdas) == 2
     return made
 
 
 def test_a_trial_that_starts_again_has_the_rates_of_the_first():
     made, trials = head_scheduler(), []
-    untouched = restarts({"compensation": made})
+    untouched = schedules.restarts({"compensation": made})
     notify_pruned({"compensation": made}, 0, SPARSE)
-    began = restarts({"compensation": made})
+    began = schedules.restarts({"compensation": made})
     for _ in range(3):
         trials.append([])
         for _ in range(12):
             trials[-1].append([group["lr"] for group in made.optimizer.param_groups])
             made.optimizer.step()
             made.step()
-        put_restarts({"compensation": made}, began, 12 * len(trials))
+        schedules.put_restarts({"compensation": made}, began, 12 * len(trials))
     first, *others = ([weights for weights, _ in trial] for trial in trials)
     assert all(weights == biases for trial in trials for weights, biases in trial)
     assert first[0] == pytest.approx(1 / 10 * 1e-2)
@@ -278,7 +258,7 @@ def test_a_trial_that_starts_again_has_the_rates_of_the_first():
         # The decay has less time left.
         assert other == pytest.approx(first, rel=0.06)
     # A field that was not pruned yet has the rates of before the prune again.
-    put_restarts({"compensation": made}, untouched, 0)
+    schedules.put_restarts({"compensation": made}, untouched, 0)
     assert made.optimizer.param_groups[0]["lr"] == 1e-2
 
 
@@ -291,10 +271,10 @@ def test_the_rates_of_a_trial_decay_as_those_of_a_run():
 
 def test_the_rise_of_a_rate_is_limited_before_it_begins():
     made = head_scheduler()
-    limit_rise({"compensation": made}, 20)
-    limit_rise({"compensation": made}, 4)
+    schedules.limit_rise({"compensation": made}, 20)
+    schedules.limit_rise({"compensation": made}, 4)
     notify_pruned({"compensation": made}, 0, SPARSE)
-    limit_rise({"compensation": made}, 1)
+    schedules.limit_rise({"compensation": made}, 1)
     assert made.optimizer.param_groups[0]["lr"] == pytest.approx(1 / 5 * 1e-2)
     assert {decay.warmup_steps for decay in made.lr_lambdas} == {4}
 

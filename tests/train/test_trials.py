@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from fields import random_field
 from models import Training
 from torch.optim import SGD, Adam
 from torch.optim.lr_scheduler import LambdaLR
@@ -226,11 +227,9 @@ def test_only_trials_do_without_mirrored_images(undecided):
 
 
 @pytest.mark.parametrize("with_head", [False, True])
-def test_a_part_of_a_field_tells_the_size_of_all_of_it(with_head):
-    n, generator = 20_000, torch.Generator().manual_seed(0)
-    shapes = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (1,), "features_dc": (3,)}
-    shapes |= {"features_rest": (3, 3), FEATURES: (5,)}
-    gaussians = {name: torch.randn(n, *shape, generator=generator) for name, shape in shapes.items()}
+def test_a_part_of_a_field_tells_the_size_of_all_of_it(with_head, monkeypatch):
+    monkeypatch.setattr(trials_module, "SAMPLE", 2000)
+    gaussians = random_field(5000, degree=1)
     head = CompensationHead(HeadConfig(mode="residual", size="tiny", num_features=5)) if with_head else None
     found = packed_size(gaussians, head)
     packed = {name: value for name, value in gaussians.items() if with_head or name != FEATURES}
@@ -239,4 +238,4 @@ def test_a_part_of_a_field_tells_the_size_of_all_of_it(with_head):
     assert found[1] == pytest.approx(of_head, rel=0.01)
     assert (found[1] > 0) == with_head
     assert found[0] == pytest.approx(len(data) - of_head, rel=0.1)
-    assert packed_size({**gaussians, "means": torch.full((n, 3), torch.nan)}) is None
+    assert packed_size({**gaussians, "means": torch.full((5000, 3), torch.nan)}) is None
