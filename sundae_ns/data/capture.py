@@ -104,9 +104,7 @@ def check_transforms(path: Path, *, splits: Sequence[str] = ()) -> dict[str, Any
     if FISHEYE624 in kinds:  # nerfstudio makes the masks of such a lens, and reads it with no other kind
         counts = ", ".join(f"{count} images with {kind}" for kind, count in sorted(kinds.items()))
         if len(kinds) > 1:
-            raise DataError(
-                f"{path.name}: FISHEYE624 cannot be mixed with other lenses ({counts}); undistort the images"
-            )
+            raise DataError(f"{path.name}: FISHEYE624 beside other lenses ({counts}); undistort the images")
         _radius(meta.get("fisheye_crop_radius"), "fisheye_crop_radius", path.name)
         if "mask_path" in frames[0]:
             raise DataError(f"{path.name}: nerfstudio makes the masks of a FISHEYE624 camera; remove mask_path")
@@ -120,9 +118,7 @@ def check_transforms(path: Path, *, splits: Sequence[str] = ()) -> dict[str, Any
             raise DataError(f"{path.name} lists images for {', '.join(listed)}, but none for {split}; {remedy}")
         for file in files:
             if str(Path(file)) not in known:
-                raise DataError(
-                    f"{path.name}: {name} has {file!r:.80}, which no frame has as its file_path; correct it"
-                )
+                raise DataError(f"{path.name}: {name} has {file!r:.80}, which no frame has as file_path; correct it")
     return meta
 
 

@@ -150,10 +150,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         **kwargs: Any,
     ) -> None:
         if config.train_cameras_sampling_strategy != "random":
-            raise ConfigError(
-                "train-cameras-sampling-strategy fps is not a function of seed and step, so a resumed run would "
-                "differ; use random"
-            )
+            raise ConfigError("train-cameras-sampling-strategy fps is not a function of seed and step; use random")
         check_ranges(config)
         set_parser(config.dataparser, config.robust_frame)
         splits = ("train", "val" if test_mode == "val" else "test")
@@ -269,10 +266,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             # The stock "cpu" cache pins memory, which needs a driver; "gpu" means the model's device.
             cache_images_device = "gpu"
         elif cache_images_device == "gpu" and full:
-            _log.info(
-                f"the {split} images need more than half of the free GPU memory: they stay in main memory, and each "
-                "step copies one"
-            )
+            _log.info(f"the {split} images need more than half of the free GPU memory, so they stay in main memory")
             cache_images_device = "cpu"
         load = rebound(FullImageDatamanager._load_images, _undistort_image=undistorting(dataset.image_filenames))
         perspective, cameras.camera_type = cameras.camera_type, dataset.lenses  # undistort by the types of the files
@@ -281,10 +275,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         finally:
             cameras.camera_type = perspective
         if split == "train" and loaded and not any(map(_shows_something, loaded)):
-            raise DataError(
-                f"all {len(loaded)} training images are fully transparent or masked, so there is nothing to train on; "
-                "check their alpha channel and their masks"
-            )
+            nothing = f"all {len(loaded)} training images are fully transparent or masked"
+            raise DataError(f"{nothing}; check their alpha channel and their masks")
         if split == "train" and (transparent := sum(batch["image"].shape[-1] == 4 for batch in loaded)):
             _log.info(
                 f"{transparent} of {len(loaded)} training images have an alpha channel: what is transparent is trained "

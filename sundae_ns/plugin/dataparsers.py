@@ -81,10 +81,7 @@ def check_capture(parser: DataParserConfig, data: Path, splits: Sequence[str], *
     """
     check_ranges(parser)
     if not data.exists():
-        raise DataError(
-            f"{data} does not exist; give the folder of the capture with --data, or, for a command of nerfstudio that "
-            "has no --data, correct data in the run's config.yml"
-        )
+        raise DataError(f"{data} does not exist; give the folder of the capture with --data, or in config.yml")
     if isinstance(parser, ColmapDataParserConfig):
         model = data / parser.colmap_path
         if not model.is_dir():
@@ -299,10 +296,8 @@ class LightNerfstudioParser(_Placed, Nerfstudio):
             rounded = len(finite) > 0 and np.array_equal(finite, finite.astype(np.float32))
             if rounded and _float32_step(finite) > COARSE_STEP:
                 step = np.spacing(np.float32(np.abs(self.offset).max()))
-                warn(
-                    f"{ply_file_path.name} has float32 coordinates that are {step:.2g} apart, as it lies far from the "
-                    "origin; export it with double coordinates, or shifted"
-                )
+                what = f"{ply_file_path.name} has float32 coordinates that are {step:.2g} apart"
+                warn(f"{what}, as it lies far from the origin; export it with double coordinates, or shifted")
             points = points.double() - torch.from_numpy(self.offset)
         points = points.float() @ transform_matrix[:3, :3].T + transform_matrix[:3, 3]
         # nerfstudio multiplies by applied_scale again, but the file's cloud is in the coordinates of its cameras.
@@ -389,9 +384,7 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
     if strange.any():
         i = _first(strange)
         size = f"{float(cameras.fx[i]):.3g} px and the image is {int(cameras.width[i])} px wide"
-        raise DataError(
-            f"the focal length of {names[i].name} is {size}, which no lens has; give the focal length in pixels"
-        )
+        raise DataError(f"the focal length of {names[i].name} is {size}, which no lens has; give it in pixels")
     centres = cameras.camera_to_worlds[:, :, 3]
     middle = centres.median(dim=0).values
     distances = (centres - middle).norm(dim=1)

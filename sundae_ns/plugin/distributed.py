@@ -47,16 +47,11 @@ HEAD = "compensation"  # Name of the head's optimizer: every rank holds a copy o
 
 def check_options(config: Any) -> None:
     """Raise ``ConfigError`` for the first option of a ``SundaeTrainerConfig`` that several ranks cannot use."""
-    ranks, device_type = config.machine.num_devices, config.machine.device_type
-    if device_type != "cuda":
-        raise ConfigError(
-            f"--machine.num-devices {ranks} needs GPUs, and --machine.device-type is {device_type}; "
-            "give --machine.num-devices 1"
-        )
+    ranks, device = config.machine.num_devices, config.machine.device_type
+    if device != "cuda":
+        raise ConfigError(f"--machine.num-devices {ranks} needs GPUs, and --machine.device-type is {device}; give 1")
     if ranks > (gpus := torch.cuda.device_count()):
-        raise ConfigError(
-            f"--machine.num-devices is {ranks} and there are {gpus} GPUs; give --machine.num-devices {max(gpus, 1)}"
-        )
+        raise ConfigError(f"--machine.num-devices is {ranks} and there are {gpus} GPUs; give {max(gpus, 1)}")
     model, pruning = config.pipeline.model, config.pipeline.model.pruning
     counted = pruning.max_gaussians is not None or pruning.target_gaussians is not None
     for name, given in (

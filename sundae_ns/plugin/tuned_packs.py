@@ -70,9 +70,7 @@ def finetune(
     opened = load_model(run, data, split="val")
     pipeline, model = opened.pipeline, opened.model
     if model.state.densifying:
-        raise CheckpointError(
-            f"{run} was saved during densification; train it to its end, or pack it without a fine-tune"
-        )
+        raise CheckpointError(f"{run} was saved during densification; train it to its end, or leave out the fine-tune")
     place(model, scene.gaussians)
     # Rounded quaternions have length 1, and gradients refer to them.
     model.gauss_params["quats"].data = torch.nn.functional.normalize(model.gauss_params["quats"].data)

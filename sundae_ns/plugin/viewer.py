@@ -176,9 +176,7 @@ class ViewerControls(torch.nn.Module):
             if detail not in self._contributions:
                 viewer: Any = getattr(self.control, "viewer", None)
                 if viewer is None:
-                    raise ConfigError(
-                        "there are no training views; open the run with ns-viewer, or choose another rule"
-                    )
+                    raise ConfigError("there are no training views; open the run with ns-viewer, or take another rule")
                 self._contributions = {detail: self._contribute(viewer.pipeline.datamanager, detail)}
             weights = self._contributions[detail]
         return prune_gaussians(gaussians, rule, count, weights, self._graphs.get(rule.edges))

@@ -116,7 +116,7 @@ REFUSED = {
     "a round lens and masks": ({**ROUND, "fisheye_crop_radius": 7.0, "frames": masked(FIRST)}, "remove mask_path"),
     "distortion NaN": ({"k1": NAN}, "k1 is nan"),
     "distortion of 3 numbers": ({"distortion_params": [0, 0, 0]}, "4, 6 or 12"),
-    "a split of other images": ({"frames/1/file_path": "images/none.png"}, "which no frame has as its file_path"),
+    "a split of other images": ({"frames/1/file_path": "images/none.png"}, "which no frame has as file_path"),
     "a missing split": ({"train_filenames": ["a.png"], "val_filenames": None}, "train_filenames|val_filenames"),
     "no list of test images": ({"val_filenames": GONE, "test_filenames": GONE}, "none for val"),
     "a mask for one": ({"frames/1/mask_path": FIRST}, "1 of .* frames have a mask_path"),

@@ -283,8 +283,8 @@ def test_a_signal_to_the_command_ends_it_or_reaches_the_ranks(still_life, tmp_pa
             {"pipeline.model.pruning.mode": "continuous", "pipeline.model.pruning.max_gaussians": 9},
             "continuous pruning to a count",
         ),
-        ({"machine.device_type": "cpu"}, "needs GPUs.*device-type is cpu"),
-        ({"machine.num_devices": 3}, "is 3 and there are 2 GPUs; give --machine.num-devices 2"),
+        ({"machine.device_type": "cpu"}, "needs GPUs.*device-type is cpu; give 1"),
+        ({"machine.num_devices": 3}, "is 3 and there are 2 GPUs; give 2"),
     ],
 )
 def test_what_several_ranks_cannot_do_is_refused_before_anything_is_written(tmp_path, monkeypatch, options, words):
