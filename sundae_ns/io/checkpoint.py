@@ -162,9 +162,7 @@ def check_extra_state(state: Mapping[str, Any], num_features: int, encoding: Enc
     extra = state.get(EXTRA_STATE)
     if not isinstance(extra, Mapping) or extra.get("method") != "sundae":
         kind = "a splatfacto checkpoint" if _PREFIX + "means" in state else "the checkpoint of another method"
-        raise CheckpointError(
-            f"this is {kind}, not one of sundae; start from it with --pipeline.model.warm-start PATH, not --load-dir"
-        )
+        raise CheckpointError(f"this is {kind}; start from it with --pipeline.model.warm-start PATH, not --load-dir")
     _check_format(extra)
     for name, ours, hint in (
         ("num_features", num_features, "head.num-features that it was trained with (0 means a model without a head)"),

@@ -35,6 +35,7 @@ from sundae_ns.core.gaussians import SH_C0, sh_degree
 from sundae_ns.io.budget import afford, afford_gaussians, parsed_json
 from sundae_ns.io.coordinates import similarity
 from sundae_ns.io.ply import LEAST_OPACITY, MAX_SH_DEGREE, UNMARKED, Marks, check_gaussians, checked, vector
+from sundae_ns.io.splat import joined
 from sundae_ns.io.spz import decoded
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -50,6 +51,7 @@ _TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _FROM_MODEL = torch.tensor([[-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 0.0]])  # its own inverse
 _FROM_PLY = torch.tensor([[-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]])  # its own inverse
+Json = Mapping[str, Any]
 Transforms = NDArray[np.float64]
 _OURS, _MARKS = "sundae_ns", ("antialiased", "modelFrame", "up", "offset")  # extras of the asset, in the order of Marks
 
@@ -136,11 +138,8 @@ def read_glb(path: Path) -> tuple[dict[str, Tensor], Marks]:
             raise ValueError("its JSON is not that of a glTF scene") from error
         if not parts:
             raise ValueError(f"no mesh of its scene has {EXTENSION}")
-        if len({part["features_rest"].shape[1] for part in parts}) > 1:
-            raise ValueError("its Gaussians have different SH degrees")
-        params = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
         marks = Marks(antialiased, in_model_frame, up, offset)
-        return similarity(params, _FROM_MODEL if in_model_frame else _FROM_PLY, 1.0), marks
+        return similarity(joined(parts), _FROM_MODEL if in_model_frame else _FROM_PLY, 1.0), marks
 
 
 def _chunks(path: Path) -> tuple[dict[str, Any], memoryview]:
@@ -159,11 +158,11 @@ def _chunks(path: Path) -> tuple[dict[str, Any], memoryview]:
     return parsed_json(bytes(chunks[_JSON])), chunks[_BINARY]
 
 
-def _primitives(document: Mapping[str, Any], binary: memoryview) -> Iterator[tuple[Mapping[str, Any], Transforms]]:
+def _primitives(document: Json, binary: memoryview) -> Iterator[tuple[Json, Transforms]]:
     """Primitives with Gaussians that the scene shows, each once, and the transforms of all nodes that show it."""
     nodes = document.get("nodes", [])
     seen: set[int] = set()
-    shown: list[tuple[Mapping[str, Any], int]] = []  # nodes after their parents, and the positions of these
+    shown: list[tuple[Json, int]] = []  # nodes after their parents, and the positions of these
 
     def visit(indices: list[Any], parent: int) -> None:
         for index in indices:
@@ -207,7 +206,7 @@ def _index(value: object) -> int:
     return value
 
 
-def _below_parents(nodes: list[Mapping[str, Any]]) -> Transforms:
+def _below_parents(nodes: list[Json]) -> Transforms:
     """The nodes' own transforms ``[N, 4, 4]``."""
     parts = {}
     for name, none in {"translation": [0] * 3, "rotation": [0, 0, 0, 1], "scale": [1] * 3, "matrix": [0] * 16}.items():
@@ -228,9 +227,7 @@ def _transforms(parts: Mapping[str, NDArray[Any]]) -> Transforms:
     return transforms
 
 
-def _read_primitive(
-    document: Mapping[str, Any], binary: memoryview, primitive: Mapping[str, Any]
-) -> tuple[dict[str, Tensor], Marks]:
+def _read_primitive(document: Json, binary: memoryview, primitive: Json) -> tuple[dict[str, Tensor], Marks]:
     """The Gaussians of a primitive in its own coordinates, and whether they are marked as antialiased."""
     extension = primitive["extensions"][EXTENSION]
     compressed = extension.get("extensions", {})
@@ -279,7 +276,7 @@ def _placed(gaussians: Mapping[str, Tensor], transforms: Transforms) -> dict[str
     return {name: value.expand(len(rigid), *gaussians[name].shape).flatten(0, 1) for name, value in placed.items()}
 
 
-def _view(document: Mapping[str, Any], binary: memoryview, index: object) -> memoryview:
+def _view(document: Json, binary: memoryview, index: object) -> memoryview:
     """The bytes of a buffer view."""
     view = document["bufferViews"][_index(index)]
     if _index(view.get("buffer", 0)) != 0 or "uri" in document["buffers"][0] or view.get("extensions"):
@@ -290,7 +287,7 @@ def _view(document: Mapping[str, Any], binary: memoryview, index: object) -> mem
     return binary[start : start + length]
 
 
-def _values(document: Mapping[str, Any], binary: memoryview, index: object) -> NDArray[np.float32]:
+def _values(document: Json, binary: memoryview, index: object) -> NDArray[np.float32]:
     """Values of an accessor ``[N, C]``; integers are normalised if it says so."""
     accessor = document["accessors"][_index(index)]
     if "sparse" in accessor or "bufferView" not in accessor:

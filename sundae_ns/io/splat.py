@@ -54,13 +54,13 @@ def _gaussians(rows: NDArray[Any], means: NDArray[Any], quats: NDArray[Any], res
     return params
 
 
-def _joined(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+def joined(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:
     """The Gaussians of all parts; ``ValueError`` if there are none, or if they differ in their SH degree."""
     parts = [part for part in parts if len(part["means"])]
     if not parts:
         raise ValueError("it has no Gaussians")
     if len({part["features_rest"].shape[1:] for part in parts}) > 1:
-        raise ValueError("its sections or ranks have different SH degrees")
+        raise ValueError("its parts have different SH degrees")
     return {name: torch.cat([part[name] for part in parts]) for name in SPLAT_NAMES}
 
 
@@ -88,7 +88,7 @@ def read_ksplat(path: Path) -> dict[str, Tensor]:
             section = _SECTION.unpack_from(data, _HEADER_BYTES + i * _SECTION_BYTES)
             part, start = _section(data, start, level, (low or -1.5, high or 1.5), section)
             parts.append(part)
-        return _joined(parts)
+        return joined(parts)
 
 
 def _section(
@@ -137,7 +137,7 @@ def read_gsplat(path: Path) -> dict[str, Tensor]:
             check_whole(file)
             parts.append(_trained(load_tensors(file)))
     with reading(path, "a checkpoint of gsplat", remedy="give another file"):
-        return _joined(parts)
+        return joined(parts)
 
 
 def _trained(loaded: Any) -> dict[str, Tensor]:

@@ -53,7 +53,7 @@ def _without(name):
     [
         (_without("_extra_state"), "splatfacto checkpoint.*warm-start"),
         ({"field.weight": torch.zeros(1)}, "another method.*warm-start"),
-        (model_state(method="other"), "not one of sundae"),
+        (model_state(method="other"), "a splatfacto checkpoint.*warm-start"),
         (model_state(format=1), "format 1, this version reads 2; use the version that wrote it"),
         (model_state(format=99), "format 99"),
         (model_state(encoding="logits"), "encoding logits, the model harmonics; .*sh-degree"),
