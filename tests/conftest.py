@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import gc
-import importlib
 import os
 import shutil
 import subprocess
@@ -132,15 +131,6 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
         return folder
 
     return made
-
-
-@pytest.fixture(scope="session")
-def open3d() -> None:
-    """Skip if open3d cannot be imported: it loads libraries of a desktop."""
-    try:
-        importlib.import_module("open3d")
-    except (ImportError, OSError) as error:
-        pytest.skip(f"open3d does not import here: {error}")
 
 
 @pytest.fixture(scope="session")
