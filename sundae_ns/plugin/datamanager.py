@@ -160,11 +160,9 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         except SundaeError:
             raise
         except EOFError as error:
-            raise DataError(
-                "nerfstudio asks whether to make the smaller images of --downscale-factor with ffmpeg, but there is no "
-                "terminal to answer it; start the command once in a terminal and answer y, or train on images of full "
-                "size with --downscale-factor 1"
-            ) from error
+            asked = "nerfstudio asks whether to make the smaller images of --downscale-factor, and no terminal answers"
+            remedy = "start the command once in a terminal and answer y, or give --downscale-factor 1"
+            raise DataError(f"{asked}; {remedy}") from error
         except Exception as error:  # parsers raise many kinds, assertions too, with one meaning for the user
             raise DataError(f"{config.capture} cannot be parsed ({one_line(error)}); check the capture") from error
         self.hold_back(())
@@ -175,10 +173,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         """Training set, with the transform from the capture's coordinates to the model's in its metadata."""
         outputs, parser = self.train_dataparser_outputs, cast(Any, self.config.dataparser)
         if (count := len(outputs.image_filenames)) < 2:
-            raise DataError(
-                f"{parser.data} has {count or 'no'} training image{'s' * (count != 1)}, and training needs 2 or more; "
-                "check the path and the split (--eval-mode)"
-            )
+            few = f"{parser.data} has {count or 'no'} training image{'s' * (count != 1)}, and training needs 2 or more"
+            raise DataError(f"{few}; check the path and the split (--eval-mode)")
         points = outputs.metadata.get("points3D_xyz")
         check_cameras(outputs.cameras, outputs.image_filenames, points)
         if points is not None:
@@ -278,10 +274,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             nothing = f"all {len(loaded)} training images are fully transparent or masked"
             raise DataError(f"{nothing}; check their alpha channel and their masks")
         if split == "train" and (transparent := sum(batch["image"].shape[-1] == 4 for batch in loaded)):
-            _log.info(
-                f"{transparent} of {len(loaded)} training images have an alpha channel: what is transparent is trained "
-                "to be empty space. To leave pixels out instead, give masks (mask_path in transforms.json)"
-            )
+            what = f"{transparent} of {len(loaded)} training images have an alpha channel"
+            _log.info(f"{what}: what is transparent is trained to be empty space; to leave pixels out, give masks")
         return loaded
 
 
@@ -314,10 +308,8 @@ def undistorting(paths: Sequence[Path]) -> Callable[..., Result]:
                 cause = f"cannot be undistorted ({one_line(error)})"
         if result is None:
             values = ", ".join(f"{float(value):.3g}" for value in distortion_params)
-            raise DataError(
-                f"{paths[int(data['image_idx'])].name} {cause}; check its k1 ... p2 ({values}), which are of "
-                "coordinates in focal lengths, not in pixels"
-            )
+            what = f"{paths[int(data['image_idx'])].name} {cause}; check its k1 ... p2 ({values})"
+            raise DataError(f"{what}, which are of coordinates in focal lengths, not in pixels")
         return result
 
     return undistort

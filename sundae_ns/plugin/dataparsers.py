@@ -201,11 +201,9 @@ class _Placed:
         centres, robust = np.array([matrix[:3, 3] for matrix in matrices]), getattr(self.config, "robust", False)
         step, centred = _float32_step(centres) if robust else 0.0, self.config.center_method != "none"
         if step > COARSE_STEP and not centred:
-            farthest = np.abs(_distances_of(centres)[0]).max()
-            raise DataError(
-                f"{where}: the cameras stand {farthest:.3g} from the origin, where float32 numbers are "
-                f"{np.spacing(np.float32(farthest)):.2g} apart; leave out --center-method none"
-            )
+            farthest = np.float32(np.abs(_distances_of(centres)[0]).max())
+            what = f"{where}: the cameras stand {farthest:.3g} from the origin, where float32 numbers are"
+            raise DataError(f"{what} {np.spacing(farthest):.2g} apart; leave out --center-method none")
         self.offset = _distances_of(centres)[0] if step > FINE_STEP and centred else None
         self._points, self._robust = points, robust
         for frame, matrix in zip(frames, matrices, strict=True):
@@ -221,10 +219,8 @@ class _Placed:
             return cloud if cloud is None or self.offset is None else cloud - self.offset
 
         if self.config.auto_scale_poses and (poses[:, :3, 3] == poses[0, :3, 3]).all():
-            raise DataError(
-                f"all cameras of {self.config.data} stand at one place, so nothing says how far things are; correct "
-                "their poses, or, for a panorama, give --auto-scale-poses False"
-            )
+            what = f"all cameras of {self.config.data} stand at one place, so nothing says how far things are"
+            raise DataError(f"{what}; correct their poses, or, for a panorama, give --auto-scale-poses False")
         oriented, self._transform = camera_utils.auto_orient_and_center_poses(poses, **methods)
         far = stray_cameras(poses[:, :3, 3].double().numpy(), points) if self._robust else np.zeros(len(poses), bool)
         if far.any():
@@ -401,10 +397,8 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
         far = (distances > 20 * usual) & (distances > STRAY * reach)
     if far.any():
         times = f"{float(distances[_first(far)] / usual):,.0f} times as far away as most"
-        warn(
-            f"the camera of {names[_first(far)].name} is {times if usual > 0 else 'far from all others'} "
-            f"({int(far.sum())} of {len(names)} are); check its pose, or remove the view"
-        )
+        which = f"{names[_first(far)].name} is {times if usual > 0 else 'far from all others'}"
+        warn(f"the camera of {which} ({int(far.sum())} of {len(names)} are); check its pose, or remove the view")
 
 
 def warn_of_stray_tests(train: Cameras, test: Cameras, names: Sequence[Path]) -> None:
@@ -412,10 +406,8 @@ def warn_of_stray_tests(train: Cameras, test: Cameras, names: Sequence[Path]) ->
     centres = torch.cat([train.camera_to_worlds[:, :, 3], test.camera_to_worlds[:, :, 3]]).double().cpu()
     far = torch.from_numpy(stray_cameras(centres.numpy()))[len(train) :]
     if far.any():
-        warn(
-            f"the camera of {names[_first(far)].name}, a test view, stands far from all others ({int(far.sum())} of "
-            f"{len(names)} do); check its pose, or remove the view"
-        )
+        which = f"{names[_first(far)].name}, a test view, stands far from all others"
+        warn(f"the camera of {which} ({int(far.sum())} of {len(names)} do); check its pose, or remove the view")
 
 
 def _first(flags: Tensor) -> int:
@@ -427,10 +419,8 @@ def check_projection(camera: Cameras) -> None:
     """Raise ``DataError`` for a camera that asks for another projection, as a camera path may; ours are perspective."""
     kind = CameraType(int(camera.camera_type.flatten()[0]))
     if kind != CameraType.PERSPECTIVE:
-        raise DataError(
-            f"the camera is of type {kind.name.lower()}, and only perspective images can be drawn; set camera_type to "
-            "perspective in the camera path, for a panorama render the six faces of a cube"
-        )
+        what = f"the camera is of type {kind.name.lower()}, and only perspective images can be drawn"
+        raise DataError(f"{what}; set camera_type to perspective, for a panorama render the six faces of a cube")
 
 
 @torch.no_grad()
@@ -450,10 +440,8 @@ def warn_of_cloud(points: Tensor, cameras: Cameras) -> None:
         inside = (across > -0.1) & (across < 1.1) & (down > -0.1) & (down < 1.1)
         empty += not ((z < 0) & inside).any()
     if empty > 0.5 * len(cameras):
-        warn(
-            f"{empty} of {len(cameras)} views show no point of the sparse cloud, so cloud and cameras are probably in "
-            "different coordinates; export both together, or train without the cloud (remove ply_file_path)"
-        )
+        what = f"{empty} of {len(cameras)} views show no point of the sparse cloud"
+        warn(f"{what}: both are probably in different coordinates; export them together, or remove ply_file_path")
 
 
 def warn_of_other_frame(run: Path, transform: Tensor, scale: float) -> None:
@@ -465,10 +453,8 @@ def warn_of_other_frame(run: Path, transform: Tensor, scale: float) -> None:
     except (DataError, KeyError, TypeError, ValueError, RuntimeError):
         return
     if not same:
-        warn(
-            f"{run} was trained in other coordinates: its capture has changed, or another version scaled it; if "
-            "cameras stand far apart, resume it with --pipeline.datamanager.robust-frame False"
-        )
+        what = f"{run} was trained in other coordinates: its capture has changed, or another version scaled it"
+        warn(f"{what}; if cameras stand far apart, resume it with --pipeline.datamanager.robust-frame False")
 
 
 def camera_of(camera: Cameras, device: torch.device | str, *, pose: Tensor | None = None, downscale: int = 1) -> Camera:

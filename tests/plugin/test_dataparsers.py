@@ -278,7 +278,7 @@ def test_a_cloud_that_the_views_do_not_show_is_named(capture, load, capsys):
     assert "show no point" not in said(capsys)
     rewrite_cloud(capture, "f4", (50, 0, 0))
     load(capture)
-    assert "views show no point of the sparse cloud, so cloud and cameras are probably in different" in said(capsys)
+    assert "views show no point of the sparse cloud: both are probably in different coordinates" in said(capsys)
 
 
 def test_an_old_capture_takes_the_cloud_of_its_colmap_model(capture, load, edit):
