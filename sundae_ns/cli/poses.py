@@ -58,7 +58,7 @@ def poses(
         photos: folder of photos, or a video.
         out: folder of the capture; it must not exist yet.
     """
-    masks = check_poses(photos, options.frames, options.masks)
+    masks = check_poses(photos, options)
     check_folder(out, reads=[], outside=photos)
     from sundae_ns.data.reconstruct import Request, find_poses, pycolmap
 
@@ -73,22 +73,22 @@ def poses(
         print(f"# masks: {placed.masks}")
     if placed.left_out:
         names = ", ".join(placed.left_out[:3]) + (", ..." if len(placed.left_out) > 3 else "")
-        print(
-            f"# {'' if placed.enough else 'warning: '}without a pose: {names}; to add them, {placed.again}", flush=True
-        )
+        warning = "" if placed.enough else "warning: "
+        print(f"# {warning}without a pose: {names}; to add them, {placed.again}", flush=True)
     return 0
 
 
-def check_poses(photos: Path, frames: int, masks: Path | None, *, remarks: bool = True) -> Path | None:
+def check_poses(photos: Path, options: PoseOptions, *, remarks: bool = True) -> Path | None:
     """Check photos or a video by headers, print ``remarks``; the folder of masks, by default one beside the photos."""
     from sundae_ns.data.photos import LEAST_PHOTOS, find_photos, left_out, masks_beside, masks_of
     from sundae_ns.data.reconstruct import check_installed
     from sundae_ns.data.video import SUFFIXES, check_video, is_video
 
+    masks = options.masks
     check_installed()
     if not photos.exists():
         raise DataError(f"{photos} does not exist; give a folder of photos, or a video")
-    check_least(frames=(frames, LEAST_PHOTOS))
+    check_least(frames=(options.frames, LEAST_PHOTOS))
     if masks is not None and not masks.is_dir():
         raise DataError(f"{masks} is no folder of masks; give one with an image for each photo")
     if is_video(photos):

@@ -82,16 +82,13 @@ class Project:
         layout = posed_layout(self.photos) if self.posed else None
         self.train.check(self.photos)
         draft, method = self.quality == "draft", self.train.method
-        fixed = (self.train.keep, self.train.count) != (None, None) or method != "sundae"
-        decides = "needs a method that decides the number of Gaussians; leave out --keep, --count and --method"
-        steps = f"a draft has {DRAFT_STEPS:,} steps; leave out --steps or --quality"
-        for wrong, message in (
-            (draft and self.train.steps is not None, steps),
-            (draft and method == "sundae-tiny", "sundae-tiny is shorter than a draft; leave out --quality"),
-            (fixed and self.quality == "best", f"--quality best {decides}"),
-        ):
-            if wrong:
-                raise ConfigError(message)
+        if draft and self.train.steps is not None:
+            raise ConfigError(f"a draft has {DRAFT_STEPS:,} steps; leave out --steps or --quality")
+        if draft and method == "sundae-tiny":
+            raise ConfigError("sundae-tiny is shorter than a draft; leave out --quality")
+        if self.quality == "best" and (self.train.keep, self.train.count, method) != (None, None, "sundae"):
+            decides = "needs a method that decides the number of Gaussians; leave out --keep, --count and --method"
+            raise ConfigError(f"--quality best {decides}")
         if layout is not None:
             print(f"# capture in {layout.description}", flush=True)
 
@@ -188,9 +185,7 @@ def run(project: Plain[Project]) -> int:
     out = project.out
     project.check()
     if not project.posed and not _passes(lambda: placed_in(project.capture)):
-        check_poses(
-            project.photos, project.poses.frames, project.poses.masks, remarks=False
-        )  # sundae poses prints them
+        check_poses(project.photos, project.poses, remarks=False)  # sundae poses prints them
     project.claim()
     for number, step in enumerate(plan := project.plan(), start=1):
         heading = f"# step {number} of {len(plan)}, {step.name}"

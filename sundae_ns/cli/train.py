@@ -52,19 +52,18 @@ class TrainOptions(Wishes):
         ``tunes`` says whether the pack is fine-tuned, ``masks`` is a folder of them for a capture in COLMAP's layout.
         """
         words = ["ns-train", self.method, "--data", word(capture), "--output-dir", word(out)]
-        if self.keep is not None:
-            words += ["--pipeline.model.pruning.keep-ratio", f"{self.keep:g}"]
-        if self.count is not None:
-            words += ["--pipeline.model.pruning.target-gaussians", str(self.count)]
-        if self.max_mb is not None:  # trials count the bytes of packs without a fine-tune
-            most = round(self.max_mb * MEGABYTE / (FINETUNED_SIZE if tunes else 1))
-            words += ["--pipeline.model.pruning.max-bytes", str(most)]
-        if self.advanced.no_head:
-            words += ["--pipeline.model.head.mode", "off"]
-        if self.advanced.seed is not None:
-            words += ["--machine.seed", str(self.advanced.seed)]
-        if self.steps is not None:
-            words += ["--max-num-iterations", str(self.steps)]
+        # Trials count the bytes of packs without a fine-tune.
+        most = None if self.max_mb is None else round(self.max_mb * MEGABYTE / (FINETUNED_SIZE if tunes else 1))
+        given = {
+            "--pipeline.model.pruning.keep-ratio": None if self.keep is None else f"{self.keep:g}",
+            "--pipeline.model.pruning.target-gaussians": self.count,
+            "--pipeline.model.pruning.max-bytes": most,
+            "--pipeline.model.head.mode": "off" if self.advanced.no_head else None,
+            "--machine.seed": self.advanced.seed,
+            "--max-num-iterations": self.steps,
+        }
+        for option, value in given.items():
+            words += [] if value is None else [option, str(value)]
         layout = None if any(map(_is_parser, more)) else posed_layout(capture)
         of_masks = [] if masks is None else ["--masks-path", word(masks.resolve())]
         if of_masks and (layout is None or layout.words[0] != "colmap"):

@@ -12,7 +12,7 @@ from photos import photo
 from photos import photos as write_photos
 from PIL import Image
 
-from sundae_ns.cli.poses import check_poses
+from sundae_ns.cli.poses import PoseOptions, check_poses
 from sundae_ns.core.errors import DataError
 from sundae_ns.data import photos as module
 from sundae_ns.data import reconstruct
@@ -123,7 +123,7 @@ def test_photos_that_are_not_read_are_named(photos, monkeypatch, capsys, names, 
         (photos / name).parent.mkdir(exist_ok=True)
         (photos / name).touch()
     assert len(find_photos(photos)) == 3
-    check_poses(photos, 150, None)
+    check_poses(photos, PoseOptions())
     assert capsys.readouterr().out.startswith(f"# warning: {remark}")
     for path in photos.glob("*.png"):
         path.unlink()

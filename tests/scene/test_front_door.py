@@ -14,9 +14,7 @@ from fields import random_field
 from short_prunes import SHORT, short_prunes  # noqa: F401
 
 import sundae_ns as sn
-from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.head.head import CompensationHead, HeadConfig
-from sundae_ns.io.ply import write_ply
 
 ROOT = Path(__file__).parents[2]
 WITHOUT_EXAMPLE = {"PruneRule", "Quality", "Rendering", "SundaeError", "distill"}
@@ -53,11 +51,10 @@ def five_lines(text):
 def garden(tmp_path):
     gaussians = random_field(200, features=0)
     gaussians["scales"] += 2
-    write_ply(tmp_path / "garden.ply", gaussians)
+    sn.save(sn.Scene(gaussians), tmp_path / "garden.ply")
     # With a head for its one feature.
-    gaussians["features"] = torch.zeros(200, 1)
     head = CompensationHead(HeadConfig(size="tiny", num_features=1))
-    sn.save(sn.Scene(Gaussians(gaussians), head), tmp_path / "headed.sundae")
+    sn.save(sn.Scene({**gaussians, "features": torch.zeros(200, 1)}, head), tmp_path / "headed.sundae")
     return tmp_path
 
 
