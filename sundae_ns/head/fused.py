@@ -206,14 +206,12 @@ def last_layers(net: UNet) -> tuple[Tensor, Tensor, Tensor]:
 
 def bias_of(conv: nn.Conv2d) -> Tensor:
     """The bias of a convolution; all of the network's have one."""
-    assert conv.bias is not None
-    return conv.bias.detach()
+    return cast("Tensor", conv.bias).detach()
 
 
 def image_like(like: Tensor, channels: int, rows: int, columns: int, dtype: torch.dtype | None = None) -> Tensor:
     """An uninitialised image ``[1, channels, rows, columns]``, channels last."""
-    shape = (1, channels, rows, columns)
-    dtype = like.dtype if dtype is None else dtype
+    shape, dtype = (1, channels, rows, columns), dtype or like.dtype
     return torch.empty(shape, dtype=dtype, device=like.device, memory_format=torch.channels_last)
 
 

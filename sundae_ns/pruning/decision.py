@@ -82,10 +82,7 @@ def decide(
         if contribution.shape != finite.shape:
             raise DataError(f"contribution has shape {list(contribution.shape)} for {n} Gaussians: return [{n}]")
         contribution = contribution.detach()[finite.to(contribution.device)].to(finite.device)
-    if not rule.uses_graph:
-        graph = None
-    elif graph is None:
-        graph = gaussian_graph(usable, rule)
+    graph = (graph or gaussian_graph(usable, rule)) if rule.uses_graph else None
     scores, labels = score(usable, rule, graph, contribution), None
     if rule.selection == "pairs":
         assert graph is not None

@@ -108,9 +108,7 @@ def pair_labels(params: Mapping[str, Tensor], graph: NeighborGraph, weight: Tens
     if left > count:  # of islands without a bridge, and of clones, the heaviest stay
         heads = (label == torch.arange(n, device=device)).nonzero().squeeze(1)
         lightest = heads[torch.sort(groups.weight[heads], stable=True).indices[: left - count]]
-        gone = torch.zeros(n, dtype=torch.bool, device=device)
-        gone[lightest] = True
-        label = torch.where((label >= 0) & ~gone[label.clamp_min(0)], label, -1)
+        label[torch.isin(label, lightest)] = -1
     return label
 
 
