@@ -139,9 +139,8 @@ def pack(opened: Opened, path: Path) -> dict[str, Any] | None:
 
 def tune(opened: Opened, path: Path) -> dict[str, Any] | None:
     """As :func:`pack`, after the fine-tune with which ``sundae run`` packs on a GPU; None if it is impossible."""
-    config = PackConfig(**FINETUNED)  # type: ignore[arg-type]
     try:
-        scene, codecs = finetune(opened.source, contents_of(load_run(opened.source)), config, FINETUNE_STEPS)
+        scene, codecs = finetune(opened.source, contents_of(load_run(opened.source)), FINETUNED, FINETUNE_STEPS)
         _forget()
         return _written(opened, path, scene, codecs)
     # The training of hours before it must not be lost.

@@ -92,12 +92,11 @@ def reduced(
     rule: PruneRule | None = None,
     num_cameras: int | None = None,
     target_drop: float | None = None,
-    config: PackConfig | None = None,
     rounds: bool = True,
 ) -> Left:
     """What the options leave of a scene; ``out`` is the file, or one like it, to be written.
 
-    ``config`` is the precision of a pack, and ``rounds`` whether a size changes it.
+    ``rounds`` says whether a size also decides how it is rounded.
     """
     scene, rows, cameras = left.scene, left.rows, left.cameras
     if details.no_head:
@@ -140,7 +139,7 @@ def reduced(
             return after(pruned, None)
         most, suffix = int(wishes.max_mb * MEGABYTE), out.suffix.lower()
         # All columns of a .ply stay.
-        forms = forms_of(scene, suffix, config)[: 1 if copies_rows(source, out) or not rounds else None]
+        forms = forms_of(scene, suffix)[: 1 if copies_rows(source, out) or not rounds else None]
         return after(
             *prune_to_bytes(
                 scene,

@@ -6,7 +6,7 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
-from dataclasses import dataclass, field, fields, make_dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from io import StringIO
 from json import dumps
@@ -33,12 +33,6 @@ if TYPE_CHECKING:
     from sundae_ns.io.pack.packed_scene import Codecs, PackedScene
     from sundae_ns.plugin.tuned_packs import Judge
 
-_maybe: Any = Maybe
-Precision: Any = make_dataclass(
-    "Precision", [(each.name, _maybe[each.type], None) for each in fields(PackConfig)], bases=(PackConfig,)
-)
-"""The options of :class:`PackConfig`, None for those that are not given."""
-
 
 @dataclass(frozen=True)
 class PackDetails(SceneDetails):
@@ -47,13 +41,12 @@ class PackDetails(SceneDetails):
     target_drop: Maybe[float] = None
     """find the coarsest steps that lose at most this PSNR on some test views, dB."""
     finetune: int = 0
-    """training steps with quantisation in the loop before packing, for example 1000; the run is not changed. Bits and
-    steps that are not given are then coarser, for a smaller file."""
+    """training steps with quantisation in the loop before packing, for example 1000, for a smaller file; the run is not
+    changed."""
     max_cameras: int = 100
     """maximum number of training cameras to store for viewers; with 0, the capture is not needed."""
     json: Flag = False
     """print one JSON object in place of the table."""
-    precision: Plain[Precision] = field(default_factory=Precision)
 
 
 def pack(
@@ -77,9 +70,6 @@ def pack(
     if wishes.cleans and (finetune or target_drop is not None):
         whole = "--finetune and --target-drop look at photos of the whole scene"
         raise ConfigError(f"{whole}; leave out {wishes.cleans}, or cut the scene by `sundae prune` afterwards")
-    given = {name: value for name, value in vars(advanced.precision).items() if value is not None}
-    precision, config = PackConfig(**given), PackConfig(**{**(FINETUNED if finetune else {}), **given})
-    config.validate()
     check_file(out, reads=[*files_of(run), data, advanced.cameras], overwrite=advanced.overwrite)
     kind = kind_of_gaussians(run)
     for name, value in (("--finetune", finetune), ("--target-drop", target_drop), ("--data", data)):
@@ -97,9 +87,10 @@ def pack(
     scene = with_start(scene, advanced.start_view, advanced.up)
     before = Left(scene, None, len(scene), cameras=chosen_cameras(scene, advanced.cameras, None))
     # A fine-tune shrinks the file, and the search below rounds it to its size.
-    roomy = None if wishes.max_mb is None else wishes.max_mb / (FINETUNED_SIZE if tuned else 1)
-    more: dict[str, Any] = {"out": out.with_suffix(".sundae"), "config": precision, "rounds": not tuned}
-    left = reduced(before, run, replace(wishes, max_mb=roomy), advanced, **more)
+    max_mb = None if wishes.max_mb is None else wishes.max_mb / (FINETUNED_SIZE if tuned else 1)
+    roomy, like = replace(wishes, max_mb=max_mb), out.with_suffix(".sundae")
+    with redirect_stdout(sys.stderr):  # warnings, beside --json
+        left = reduced(before, run, roomy, advanced, out=like, rounds=not tuned)
     most = None if wishes.max_mb is None else int(wishes.max_mb * MEGABYTE)
     source = contents_of(left.stated)
     with progress_bar() as bar, redirect_stdout(StringIO()):  # nerfstudio's messages
@@ -107,20 +98,20 @@ def pack(
         if finetune:
             from sundae_ns.plugin.tuned_packs import finetune as tune
 
-            packs.append(tune(run, source, config, finetune, data=data, progress=lambda _: bar.advance(task)))
+            packs.append(tune(run, source, FINETUNED, finetune, data=data, progress=lambda _: bar.advance(task)))
         bar.update(task, description="Packing")
         if (tuned and most is not None) or target_drop is not None:
             from sundae_ns.plugin.tuned_packs import Search, best_pack
 
             # Starts from the source, because positions of a fitted pack are rounded.
-            searches = [Search(source, precision, judge), *(Search(*each, judge) for each in packs)]
+            searches = [Search(source, PackConfig(), judge), *(Search(*each, judge) for each in packs)]
             best = best_pack(searches, most_bytes=most, most_drop=target_drop or 0.0)
             if packs and best.scene is not packs[0][0]:
                 print("the fine-tune loses too much for the target; packed without it, try more steps", file=sys.stderr)
                 finetune = 0
             packs = [(best.scene, best.codecs)]  # both are compared already
         else:
-            packs.append(fit_scene(source, left.precision or precision))
+            packs.append(fit_scene(source, left.precision))
         report = write_fitted(out, *packs[0])
         bar.update(task, advance=1, description="Measuring")
         # Photos show what a box leaves out.

@@ -42,23 +42,22 @@ class Form(NamedTuple):
     """How a file states Gaussians."""
 
     degree: int  # Most SH degree
-    power: float = 0.0  # Steps of a pack: powers of two of those of the configuration
-    config: PackConfig = PackConfig()
+    power: float = 0.0  # Steps of a pack: powers of two of the usual ones
 
     @property
     def precision(self) -> PackConfig:
         """That of a pack."""
-        return scaled(self.config, self.power)
+        return scaled(PackConfig(), self.power)
 
 
 Written = Callable[[PrunedScene, Form, Path], int]  # writes a scene in a form into a folder, and returns the bytes
 
 
-def forms_of(scene: Scene, suffix: str, config: PackConfig | None = None) -> list[Form]:
+def forms_of(scene: Scene, suffix: str) -> list[Form]:
     """Forms to choose from, the most exact first: packs have steps, other files a degree of harmonics."""
     degree = scene.gaussians.sh_degree
     if suffix in (".sundae", ".html"):
-        return [Form(degree, power, config or PackConfig()) for power in (0.0, 0.75, 1.5)]
+        return [Form(degree, power) for power in (0.0, 0.75, 1.5)]
     return [Form(each) for each in sorted({degree, min(degree, 1), 0}, reverse=True)]
 
 

@@ -64,7 +64,6 @@ REFUSALS = {
     "pack in.ply -o a.sundae --target-drop 1 --remove-floaters": "leave out --remove-floaters",
     "pack in.ply -o a.sundae --finetune 5 --crop 0 0 0 1 1 1": "leave out --crop",
     "pack gone -o a.sundae": "gone cannot be read",
-    "pack gone -o a.sundae --scale-step 2": "scale-step is 2.0; give 0.0001 to 1",
     "pack gone -o in.bin/a.sundae": "in.bin is no folder; choose another",
     "pack gone -o a.sundae --finetune -1": "finetune is -1",
     "pack gone -o a.sundae --max-cameras -1": "max-cameras is -1",

@@ -151,7 +151,7 @@ def test_positions_are_rounded_once(tiny, scene, tmp_path):
     exact, errors = scene.gaussians["means"].double(), []
     for name, words in (("plain", []), ("targeted", ["--max-mb", 10])):
         file = tmp_path / f"{name}.sundae"
-        assert run("pack", tiny.folder, "-o", file, "--position-bits", 10, *words) == 0
+        assert run("pack", tiny.folder, "-o", file, *words) == 0
         distances = torch.cdist(exact, read_scene(file).gaussians["means"].double())
         errors.append(float(distances.amin(dim=1).max()))
     assert errors[1] < errors[0] / 4  # three bits more
@@ -185,7 +185,7 @@ def search_tuned(tuned, drop):
 @pytest.fixture(scope="module")
 def tuned(scene):
     """A pack of a scene whose rows have moved since its codecs were fitted, as training moves them."""
-    fitted, codecs = fit_scene(scene, PackConfig(**FINETUNED))
+    fitted, codecs = fit_scene(scene, FINETUNED)
     generator = torch.Generator().manual_seed(0)
     for name in codecs.gaussians:
         fitted.gaussians[name] += 0.3 * torch.randn(fitted.gaussians[name].shape, generator=generator)
@@ -213,7 +213,7 @@ def test_a_target_begins_with_the_pack_of_the_fine_tune(tuned):
     """Not with grids, bases and steps that are fitted anew, which the training did not know."""
     search = search_tuned(tuned, lambda config: config.harmonics_step)
     assert search.default == tuned
-    lost = FINETUNED["harmonics_step"]
+    lost = FINETUNED.harmonics_step
     for limit, least in ((lost, 0.95 * lost), (2 * lost, 1.9 * lost), (0.5 * lost, 0.45 * lost)):
         found = search.better_than(limit)
         assert (found.bytes <= tuned.bytes) == (limit >= lost)
@@ -325,8 +325,7 @@ def test_training_makes_up_for_the_rounding(tiny, scene, tmp_path, monkeypatch):
 
 def test_the_command_fine_tunes_a_run_whose_capture_has_moved(tiny, tmp_path, capsys):
     folder, file = moved(tiny, tmp_path), tmp_path / "a.sundae"
-    plain = PackConfig().color_step  # counts although it is that of a pack without a fine-tune
-    words = ["pack", folder, "-o", file, "--finetune", 3, "--feature-step", 0.01, "--color-step", plain]
+    words = ["pack", folder, "-o", file, "--finetune", 3]
     assert run(*words) == 2
     assert "elsewhere does not exist" in capsys.readouterr().err
     assert run(*words, "--data", tiny.scene) == 0
@@ -334,18 +333,16 @@ def test_the_command_fine_tunes_a_run_whose_capture_has_moved(tiny, tmp_path, ca
     meta = read_header(file).meta
     assert meta["source"]["finetuned"] == 3
     stored = meta["attributes"]
-    config = PackConfig(**{**FINETUNED, "feature_step": 0.01, "color_step": plain})
-    _, codecs = fit_scene(contents_of(load_run(folder, data=tiny.scene)), config)
+    _, codecs = fit_scene(contents_of(load_run(folder, data=tiny.scene)), FINETUNED)
     for name in codecs.gaussians:
         assert stored[name]["step"] == codecs.gaussians[name].step, name
-    assert stored["scales"]["step"] == FINETUNED["scale_step"]
-    assert 0.01 <= stored["features"]["step"] < 0.01 / 0.02**0.5
+    assert stored["scales"]["step"] == FINETUNED.scale_step
+    assert FINETUNED.feature_step <= stored["features"]["step"] < FINETUNED.feature_step / 0.02**0.5
 
 
 def test_a_fine_tune_that_loses_says_so(tiny, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(tuned_packs, "is_worth", lambda *_: False)
-    words = ["--finetune", 1, "--head-step", 0.021, "--color-step", 1]
-    assert run("pack", tiny.folder, "-o", tmp_path / "a.sundae", *words) == 0
+    assert run("pack", tiny.folder, "-o", tmp_path / "a.sundae", "--finetune", 1) == 0
     lost = capsys.readouterr()
     assert re.search(r"PSNR \d+\.\d\d -> \d+\.\d\d dB, SSIM 0", lost.out)
     assert re.search(r"the fine-tune of 1 steps loses \d\.\d\d dB; a pack without it has [\d,]+ bytes", lost.err)

@@ -42,16 +42,7 @@ def scaled(config: PackConfig, power: float, *, with_positions: bool = True) -> 
     return replace(config, **steps)  # type: ignore[arg-type]
 
 
-FINETUNED: dict[str, int | float] = {
-    "position_bits": 12,
-    "scale_step": 0.1,
-    "rotation_step": 0.018,
-    "color_step": 0.07,
-    "opacity_step": 0.4,
-    "harmonics_step": 0.06,
-    "feature_step": 0.2,
-    "head_step": 0.14,
-}  # coarser options for scenes that were fine-tuned with them (``sundae_ns.plugin.tuned_packs``)
+FINETUNED = PackConfig(12, 1024, 0.1, 0.018, 0.07, 0.4, 0.06, 0.2, 0.14)  # of fine-tunes (``plugin.tuned_packs``)
 FINETUNE_STEPS = 1500  # that make up for them: packs lose at most about 0.1 dB more (``curve.csv``)
 LEAST_LENGTHS = 20  # of a run, in fine-tunes, whose last steps are one: measured with a twentieth
 FINETUNED_SIZE = 0.6  # bytes of such a pack as a share of one without: 0.58 to 0.61 on six captures
