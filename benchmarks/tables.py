@@ -107,11 +107,11 @@ def quality() -> list[str]:
     return side_by_side(cells)
 
 
-def side_by_side(cells: dict[tuple[str, str], str]) -> list[str]:
-    """A table of cells by capture and method: a row for each capture, a column for each method."""
+def side_by_side(cells: dict[tuple[str, str], str], head: str = "capture") -> list[str]:
+    """A table of cells by capture and method, or other pairs: a row for each capture, a column for each method."""
     captures, methods = (list(dict.fromkeys(pair[i] for pair in cells)) for i in range(2))
     rows = [[capture, *(cells.get((capture, method), "") for method in methods)] for capture in captures]
-    return table(["capture", *methods], rows, words=1)
+    return table([head, *methods], rows, words=1)
 
 
 def speed() -> list[str]:
@@ -290,6 +290,15 @@ def prune() -> list[str]:
     return table(["capture, 50% and 10% kept", *PRUNES.values()], made, words=1)
 
 
+def sizes_asked() -> list[str]:
+    """MB and PSNR of files by the size that was asked for; trained captures come last."""
+    cells: dict[tuple[str, str], str] = {}
+    for row in sorted(lines_of("sizes_asked.csv"), key=lambda row: (row["source"], row["capture"])):
+        scene = row["capture"] + (", trained" if row["source"] == "trained" else "")
+        cells[row["asked_mb"], scene] = f"{float(row['got_mb']):.3f}, {float(row['psnr']):.1f}"
+    return side_by_side(cells, "MB asked")
+
+
 GLUE = "\0"
 """Stands for a space at which no line ends."""
 
@@ -334,7 +343,9 @@ def _first(value: Any) -> str:
 
 
 MAKERS = (quality, speed, training_time, packing, formats, packed_headline, equal_quality, multi_gpu, prune, trials)
-TABLES: dict[str, Callable[[], list[str]]] = {make.__name__.replace("_", "-"): make for make in (*MAKERS, library)}
+TABLES: dict[str, Callable[[], list[str]]] = {
+    make.__name__.replace("_", "-"): make for make in (*MAKERS, sizes_asked, library)
+}
 
 
 def with_tables(text: str) -> str:

@@ -61,7 +61,8 @@ def describe(
     """
     scene = dataclasses.replace(scene, gaussians=sanitise(scene.gaussians).gaussians)
     gaussians, cameras = scene.gaussians, cameras or scene.cameras
-    views = cameras or virtual_cameras(scene, LOOKING)
+    small = [camera.zoomed(min(512 / max(camera.width, camera.height), 1.0)) for camera in cameras]  # as a cleaning
+    views = small or virtual_cameras(scene, LOOKING)
     weights, means = weights_in(scene, views, console=console), gaussians["means"].double()
     stated = None
     if path.is_file():  # a .sog holds its meta.json anywhere
@@ -81,7 +82,7 @@ def describe(
         "bytes_by_attribute": bytes_by_attribute(scene, path),
         "seen_by": f"{len(views)} {'cameras' if cameras else 'virtual cameras'}",
         "invisible": float((weights <= 0).float().mean()),
-        "floaters": int(floater_mask(scene, cameras).sum()),
+        "floaters": int((floater_mask(scene, ()) | ((weights <= 0) & bool(cameras))).sum()),
         "crop": box_of(means, weights),
     }
 

@@ -8,8 +8,8 @@ and the graph are computed once. What is taken is then fitted, and rounded or co
 from __future__ import annotations
 
 import dataclasses
-import logging
 import math
+import sys
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
@@ -35,7 +35,6 @@ LEAST, AIM = 0.97, 0.985  # shares of the size: what is near enough, and what ea
 POWER_PER_HALVING = 2.2  # of the steps of a pack; the first guess of a search
 JUDGES, PIXELS = 8, 1 << 16  # cameras that compare candidates, and most pixels of their images
 MOST_FILES = 8  # of the last search
-_log = logging.getLogger(__name__)
 
 
 class Form(NamedTuple):
@@ -77,10 +76,10 @@ def prune_to_bytes(
     *,
     progress: bool = False,
 ) -> tuple[PrunedScene, Form]:
-    """The scene and the form of a file of 97 to 100% of ``most`` bytes; of fewer, with a warning, if that is all.
+    """The scene and the form of a file of 97 to 100% of ``most`` bytes; of fewer if that is all.
 
-    The scene is finite. ``cameras`` as for :func:`sundae_ns.prune`; every eighth compares the forms. ``ConfigError`` if
-    hardly a Gaussian fits.
+    The scene is finite. ``cameras`` as for :func:`sundae_ns.prune`; every eighth compares the forms. ``progress`` shows
+    bars and remarks on stderr. ``ConfigError`` if hardly a Gaussian fits.
     """
     n, packs = scene.num_gaussians, len({form.power for form in forms}) > 1
     order = torch.randperm(n, generator=torch.Generator().manual_seed(0)).to(scene.device)
@@ -104,8 +103,8 @@ def prune_to_bytes(
         # Sparser Gaussians take more bytes each, so the whole scene takes at most about this.
         if lines[0][0] + n * lines[0][1] <= most and (size := bytes_of(whole := rows(n), forms[0])) <= most:
             form, size = _rounded(whole, forms[0], size, most, bytes_of) if packs else (forms[0], size)
-            if size < LEAST * most:
-                _log.warning("the whole scene takes %.2f MB, less than was asked for", size / MEGABYTE)
+            if size < LEAST * most and progress:
+                print(f"the whole scene takes {size / MEGABYTE:.2f} MB, less than was asked for", file=sys.stderr)
             return whole, form
         counts = [min(n, int((AIM * most - fixed) / each)) for fixed, each in lines]
         possible = [i for i, count in enumerate(counts) if count > 0]
@@ -178,6 +177,5 @@ def _rounded(
         slope = max((power - form.power) / (math.log2(before / size) or 1.0), 0.5)
         form = form._replace(power=power)
     if best is None:
-        count = pruned.scene.num_gaussians
-        raise ConfigError(f"a file of {count:,} Gaussians has {size:,} bytes; give more than {most:,}")
+        raise ConfigError(f"a file of {len(pruned.scene):,} Gaussians has {size:,} bytes; give more than {most:,}")
     return best
