@@ -82,18 +82,16 @@ def test_no_command_runs_it(command, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "words",
+    ("option", "value"),
     [
-        ["--load-dir", "RUN/nerfstudio_models"],
-        ["--load-checkpoint", "RUN/nerfstudio_models/step-000000060.ckpt"],
-        ["--pipeline.model.warm-start", "RUN"],
+        ("--load-dir", "RUN/nerfstudio_models"),
+        ("--load-checkpoint", "RUN/nerfstudio_models/step-000000060.ckpt"),
+        ("--pipeline.model.warm-start", "RUN"),
     ],
 )
 @pytest.mark.usefixtures("hostile")
-def test_training_from_it_runs_nothing_of_it(words, call_here, monkeypatch):
-    begun = []
+def test_training_from_it_runs_nothing_of_it(option, value, call_here, monkeypatch):
+    begun, usual = [], ("--data", "CAPTURE", "--max-num-iterations", "60", "--vis", "tensorboard")
     monkeypatch.setattr("nerfstudio.scripts.train.launch", lambda config, **_: begun.append(config.setup(local_rank=0)))
-    call_here(
-        "ns-train", "sundae-tiny", "--data", "CAPTURE", "--max-num-iterations", "60", "--vis", "tensorboard", *words
-    )
+    call_here("ns-train", "sundae-tiny", *usual, option, value)
     begun[0].setup()

@@ -40,9 +40,6 @@ def quality(opened, name="rgb"):
     return fmean(float(psnr(image, truth)) for image, truth in zip(images, opened.truths, strict=True))
 
 
-# --------------------------------------------------------------------------------------------------------- the command
-
-
 @pytest.fixture(scope="module")
 def packed(tiny, tmp_path_factory):
     file = tmp_path_factory.mktemp("packed") / "tiny.sundae"
@@ -122,9 +119,6 @@ def moved(tiny, folder):
     config = copied / "config.yml"
     config.write_text(config.read_text().replace(f"- {tiny.scene.name}\n", "- elsewhere\n"))
     return copied
-
-
-# ------------------------------------------------------------------------------------------------------------- targets
 
 
 def test_a_target_of_bytes_is_met_and_used(tiny, tmp_path, capsys):
@@ -271,8 +265,6 @@ def test_steps_grow_together():
     for power in (-40.0, 40.0):
         scaled(PackConfig(), power).validate()
 
-
-# ----------------------------------------------------------------------------------------------------------- fine-tune
 
 COARSE = PackConfig(position_bits=12, **dict(zip(STEPS, (0.3, 0.08, 0.9, 0.5, 1.0, 0.3, 0.1), strict=True)))
 

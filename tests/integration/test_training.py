@@ -105,9 +105,6 @@ def test_checkpoints_are_plain_and_hold_no_lpips(tiny, step, pruned_at):
         assert (moments == {}) if (name, step) == ("features", 30) else moments["exp_avg"].shape == value.shape
 
 
-# ------------------------------------------------------------------------------------------------------------- resumed
-
-
 def assert_same(whole, resumed):
     """Field, moments, rates and random numbers of two checkpoints."""
     for part in ("pipeline", "optimizers", "schedulers"):
@@ -222,9 +219,6 @@ def test_full_memory_in_the_backward_pass(tiny, resumed, monkeypatch):
         trainer.train()
 
 
-# ---------------------------------------------------------------------------------------------------------- warm starts
-
-
 def stock_checkpoint(path, params):
     """What nerfstudio saves, whose scheduler torch loads only where everything is loaded."""
     optimizer = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr=1.6e-4)
@@ -276,9 +270,6 @@ def test_few_views_start_from_more_points_and_resume_without_looking_for_them_ag
     again.train()
     for name, value in whole.model.gauss_params.items():
         assert torch.equal(again.model.gauss_params[name], value), name
-
-
-# ------------------------------------------------------------------------------------------------------- recorded steps
 
 
 class Failing(RecordedStep):
@@ -335,8 +326,6 @@ def test_what_cannot_be_recorded_runs_as_before_under_every_default_dtype(traine
         results.append(dict(trainer.model.gauss_params))
     assert all(torch.equal(value, results[1][name]) for name, value in results[0].items())
 
-
-# ------------------------------------------------------------------------------------------------------------ on a GPU
 
 SPREAD = 1.0
 """dB between two runs of one seed: CUDA sums in no fixed order; five such runs had a standard deviation of 0.2 dB."""
