@@ -104,7 +104,7 @@ def test_integers_are_normalised(tmp_path):
         attributes[f"{EXTENSION}:{name}"] = len(document["accessors"]) - 1
     write(tmp_path / "b.glb", document, binary)
     found, truth = (read_glb(tmp_path / name)[0] for name in ("b.glb", "a.glb"))
-    assert_close(found, truth, {"opacities": 2e-4, "quats": 2e-4})
+    assert_close(found, truth, {"opacities": 1e-5, "quats": 1e-4})
 
 
 FAR = [5e5 + 1 / 8, 30, -4e6 + 1 / 16]
