@@ -12,7 +12,7 @@ from PIL import Image
 
 from sundae_ns.core.errors import DataError
 
-PERSPECTIVE, FISHEYE, FISHEYE624 = "OPENCV", "OPENCV_FISHEYE", "FISHEYE624"  # the kinds that nerfstudio undistorts
+KINDS = PERSPECTIVE, FISHEYE, FISHEYE624 = "OPENCV", "OPENCV_FISHEYE", "FISHEYE624"  # those that nerfstudio undistorts
 INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # in the order of nerfstudio's distortion_params
 _NO_LENSES = {"FOV": 7, "RAD_TAN_THIN_PRISM_FISHEYE": 11, "SIMPLE_DIVISION": 12, "DIVISION": 13, "EUCM": 16}

@@ -26,15 +26,7 @@ from torch import Tensor
 from sundae_ns.core.errors import ConfigError, DataError, SundaeError, one_line, reading
 from sundae_ns.data.images import TURNED, check_image, decoded, exif_orientation, turned, wrong_size
 from sundae_ns.data.layouts import larger_model, unused_masks
-from sundae_ns.plugin.dataparsers import (
-    check_cameras,
-    check_capture,
-    check_ranges,
-    rebound,
-    set_parser,
-    warn_of_cloud,
-    warn_of_stray_tests,
-)
+from sundae_ns.plugin.dataparsers import check_cameras, check_capture, check_ranges, check_tests, rebound, set_parser
 from sundae_ns.train.progress import warn
 
 _log = logging.getLogger(__name__)
@@ -175,10 +167,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         if (count := len(outputs.image_filenames)) < 2:
             few = f"{parser.data} has {count or 'no'} training image{'s' * (count != 1)}, and training needs 2 or more"
             raise DataError(f"{few}; check the path and the split (--eval-mode)")
-        points = outputs.metadata.get("points3D_xyz")
-        check_cameras(outputs.cameras, outputs.image_filenames, points)
-        if points is not None:
-            warn_of_cloud(points, outputs.cameras)
+        check_cameras(outputs.cameras, outputs.image_filenames, outputs.metadata.get("points3D_xyz"))
         folder, is_colmap = self.config.capture, isinstance(parser, ColmapDataParserConfig)
         folder = folder.parent if folder.is_file() else folder
         if outputs.mask_filenames is None and (masks := unused_masks(folder)) is not None:
@@ -196,7 +185,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         """Test set."""
         dataset = super().create_eval_dataset()
         if names := dataset.image_filenames:
-            warn_of_stray_tests(self.train_dataparser_outputs.cameras, dataset.cameras, names)
+            check_tests(self.train_dataparser_outputs.cameras, dataset.cameras, names)
         else:
             dataset.cameras = cast(Any, NoTestViews(self.config.capture))
         return dataset

@@ -32,23 +32,14 @@ from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.data.capture import check_first_image, check_transforms, read_json, rigid
 from sundae_ns.data.colmap import ColmapImage, check_colmap, read_images, read_points
 from sundae_ns.data.layouts import no_model, no_transforms
-from sundae_ns.data.lenses import (
-    DISTORTION,
-    FISHEYE,
-    FISHEYE624,
-    INTRINSICS,
-    PERSPECTIVE,
-    Lens,
-    lens_of,
-    with_focal_lengths,
-)
+from sundae_ns.data.lenses import DISTORTION, INTRINSICS, KINDS, PERSPECTIVE, Lens, lens_of, with_focal_lengths
 from sundae_ns.io.ply import read_point_cloud
 from sundae_ns.scene.load_save import FRAME_FILE
 from sundae_ns.train.progress import warn
 
 Array = NDArray[np.float64]
 
-TYPES = {name: CAMERA_MODEL_TO_TYPE[name].value for name in (PERSPECTIVE, FISHEYE, FISHEYE624)}
+TYPES = {name: CAMERA_MODEL_TO_TYPE[name].value for name in KINDS}
 """nerfstudio's camera type of each kind of lens."""
 STRAY = 10.0  # A camera is stray if it stands more than this many times as far from the middle as the others
 FINE_STEP, COARSE_STEP = 1e-5, 1e-3
@@ -107,9 +98,8 @@ def set_parser(config: DataParserConfig, robust: bool) -> None:
 
 def rebound(method: Any, **names: Any) -> Any:
     """A copy of a function in which global ``names`` have these values; the function itself stays as it is."""
-    copy = FunctionType(
-        method.__code__, {**method.__globals__, **names}, method.__name__, method.__defaults__, method.__closure__
-    )
+    scope = {**method.__globals__, **names}
+    copy = FunctionType(method.__code__, scope, method.__name__, method.__defaults__, method.__closure__)
     copy.__kwdefaults__ = method.__kwdefaults__
     return copy
 
@@ -381,6 +371,8 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
         i = _first(strange)
         size = f"{float(cameras.fx[i]):.3g} px and the image is {int(cameras.width[i])} px wide"
         raise DataError(f"the focal length of {names[i].name} is {size}, which no lens has; give it in pixels")
+    if points is not None:
+        warn_of_cloud(points, cameras)
     centres = cameras.camera_to_worlds[:, :, 3]
     middle = centres.median(dim=0).values
     distances = (centres - middle).norm(dim=1)
@@ -388,10 +380,8 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
         warn("all cameras stand at one place, so nothing says how far things are; check the poses")
         return
     usual = distances.median()
-    cloud = None if points is None or not len(points) else points
-    far = torch.from_numpy(
-        stray_cameras(centres.double().numpy(), lambda: None if cloud is None else cloud.double().cpu().numpy())
-    )
+    cloud = None if points is None or not len(points) else points.double().cpu()
+    far = torch.from_numpy(stray_cameras(centres.double().numpy(), lambda: None if cloud is None else cloud.numpy()))
     if not far.any() and usual > 0:
         reach = 0.0 if cloud is None else float((cloud - middle).norm(dim=1).median())
         far = (distances > 20 * usual) & (distances > STRAY * reach)
@@ -401,7 +391,7 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
         warn(f"the camera of {which} ({int(far.sum())} of {len(names)} are); check its pose, or remove the view")
 
 
-def warn_of_stray_tests(train: Cameras, test: Cameras, names: Sequence[Path]) -> None:
+def check_tests(train: Cameras, test: Cameras, names: Sequence[Path]) -> None:
     """Warn of test cameras ``[M]``, of images ``names``, that stand far from all others."""
     centres = torch.cat([train.camera_to_worlds[:, :, 3], test.camera_to_worlds[:, :, 3]]).double().cpu()
     far = torch.from_numpy(stray_cameras(centres.numpy()))[len(train) :]

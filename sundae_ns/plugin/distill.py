@@ -208,9 +208,8 @@ class Distillation:
         """The scene as it is now, at unit size if its source is no nerfstudio model."""
         state = self.state
         head = state.head if state.head_enabled else None
-        gaussians = {
-            name: value.detach() for name, value in state.gaussians.items() if name != FEATURES or head is not None
-        }
+        names = [name for name in state.gaussians if name != FEATURES or head is not None]
+        gaussians = {name: state.gaussians[name].detach() for name in names}
         return dataclasses.replace(
             self._teacher,
             gaussians=Gaussians(gaussians, state.gaussians.encoding),

@@ -150,9 +150,8 @@ class RoundedTraining:
         of_rate: tuple[Tensor | None, ...] = (None,) * len(self.exact)
         if self._rate > 0:
             with torch.enable_grad():
-                gaussians, head = (
-                    {name: self.exact[name] for name in names} for names in (self._codecs.gaussians, self.head)
-                )
+                parts = self._codecs.gaussians, self.head
+                gaussians, head = ({name: self.exact[name] for name in names} for names in parts)
                 bits = estimated_bits(self._codecs, gaussians, head)
                 total = self._rate * torch.stack(list(bits.values())).sum()
             of_rate = torch.autograd.grad(total, list(self.exact.values()), allow_unused=True)
@@ -272,9 +271,8 @@ class Search:
             return min(self.default, coarsest, key=lambda candidate: candidate.bytes)
         finest = self.at(FINEST)
         if (drop := self.drop(finest)) > limit:
-            raise PackError(
-                f"the finest pack loses {drop:.3f} dB at {finest.bytes:,} bytes; give a larger --target-drop"
-            )
+            loss = f"the finest pack loses {drop:.3f} dB at {finest.bytes:,} bytes"
+            raise PackError(f"{loss}; give a larger --target-drop")
         return self._bisected(fits, finest, FINEST, 0.0)
 
     def _bisected(self, fits: Callable[[Candidate], bool], best: Candidate, first: float, last: float) -> Candidate:

@@ -147,10 +147,8 @@ class ViewerControls(torch.nn.Module):
             state = self._state
             # Each change in place raises a tensor's version, in training at every step; there, count steps instead.
             counts = (value._version for value in state.gaussians.values())
-            version = (
-                *(state.gaussians.num_gaussians, state.pruning["num_prunes"], state.restored),
-                *((state.step // 100,) if self.training_gaussians else counts),
-            )
+            known = state.gaussians.num_gaussians, state.pruning["num_prunes"], state.restored
+            version = (*known, *((state.step // 100,) if self.training_gaussians else counts))
             if version != self._previewed:
                 self._previewed, self._graphs, self._contributions, self._previews = version, {}, {}, {}
             if (name, ratio) not in self._previews:
