@@ -293,7 +293,8 @@ def prune() -> list[str]:
 def sizes_asked() -> list[str]:
     """MB and PSNR of files by the size that was asked for; trained captures come last."""
     cells: dict[tuple[str, str], str] = {}
-    for row in sorted(lines_of("sizes_asked.csv"), key=lambda row: (row["source"], row["capture"])):
+    rows = lines_of("sizes_asked.csv")
+    for row in sorted(rows, key=lambda row: (row["source"], row["capture"], float(row["asked_mb"]))):
         scene = row["capture"] + (", trained" if row["source"] == "trained" else "")
         cells[row["asked_mb"], scene] = f"{float(row['got_mb']):.3f}, {float(row['psnr']):.1f}"
     return side_by_side(cells, "MB asked")
