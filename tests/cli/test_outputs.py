@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -25,15 +24,9 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.fixture
-def refused(capsys):
-    """Run a command that fails; returns its error, one line."""
-    return partial(refusal, capsys)
-
-
 @pytest.mark.parametrize("link", [None, os.symlink, os.link])
 @pytest.mark.parametrize("more", [[], ["--overwrite"]])
-def test_no_command_writes_onto_its_input(here, refused, link, more):
+def test_no_command_writes_onto_its_input(here, capsys, link, more):
     before = (here / "a.ply").read_bytes()
     out = "a.ply"
     if link is not None:
@@ -42,16 +35,16 @@ def test_no_command_writes_onto_its_input(here, refused, link, more):
     if link is os.link and more:  # the other name stays
         assert run("prune", "a.ply", "-o", out, "--num-cameras", "2", *more) == 0
     else:
-        assert out in refused("prune", "a.ply", "-o", out, *more)
+        assert out in refusal(capsys, "prune", "a.ply", "-o", out, *more)
     assert (here / "a.ply").read_bytes() == before
 
 
 @pytest.mark.parametrize("words", ["prune a.ply -o b.ply --num-cameras 2", "export a.ply -o b.spz"])
-def test_an_existing_output_needs_overwrite(here, refused, words):
+def test_an_existing_output_needs_overwrite(here, capsys, words):
     words, out = words.split(), here / words.split()[3]
     assert run(*words) == 0
     first = out.stat().st_mtime_ns
-    assert "--overwrite" in refused(*words)
+    assert "--overwrite" in refusal(capsys, *words)
     assert out.stat().st_mtime_ns == first
     assert run(*words, "--overwrite") == 0
     assert out.stat().st_mtime_ns > first
@@ -85,14 +78,14 @@ READING = ["prune in -o x.ply", "export in -o x.spz", "export run -o x.spz", "pa
 
 @pytest.mark.parametrize("words", [*READING, "compare in -o x", "compare run -o x"])
 @pytest.mark.parametrize("kind", ["pipe", "device"])
-def test_what_is_no_file_is_refused_at_once(here, refused, words, kind):
+def test_what_is_no_file_is_refused_at_once(here, capsys, words, kind):
     (here / "run" / "nerfstudio_models").mkdir(parents=True)
     for path in ("in", "run/config.yml", "run/nerfstudio_models/step-000000001.ckpt"):
         if kind == "pipe":
             os.mkfifo(here / path)
         else:
             (here / path).symlink_to("/dev/zero")
-    refused(*words.split())
+    refusal(capsys, *words.split())
     assert not list(here.glob("x*"))
 
 
@@ -110,12 +103,12 @@ def full(tmp_path):
     subprocess.run(["umount", str(folder)], check=True)
 
 
-def test_a_full_disk_is_one_line(here, full, refused):
+def test_a_full_disk_is_one_line(here, full, capsys):
     for words in (
         ["demo", full / "demo"],
         ["prune", "a.ply", "--keep", "0.9", "-o", full / "a.ply", "--num-cameras", "2"],
     ):
-        line = refused(*words)
+        line = refusal(capsys, *words)
         assert "disk is full" in line
         assert str(full) in line
     for kind in ("ply", "spz", "sog"):
@@ -123,7 +116,7 @@ def test_a_full_disk_is_one_line(here, full, refused):
         room = os.statvfs(full)
         (full / "rest").write_bytes(bytes(max(room.f_bavail - 1, 0) * room.f_bsize))
         out = full / f"b.{kind}"
-        assert str(out) in refused("export", "a.sundae", "-o", out)
+        assert str(out) in refusal(capsys, "export", "a.sundae", "-o", out)
         assert not out.exists()
 
 
