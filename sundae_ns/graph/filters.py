@@ -46,11 +46,6 @@ def high_pass(graph: NeighborGraph, signal: Tensor) -> Tensor:
     return response.reshape(signal.shape)
 
 
-def low_pass(graph: NeighborGraph, signal: Tensor) -> Tensor:
-    """Response of the low-pass filter, ``(I + A) x = 2 x - (I - A) x``; arguments as in :func:`high_pass`."""
-    return 2 * signal - high_pass(graph, signal)
-
-
 def response_magnitude(response: Tensor) -> Tensor:
     """Squared norm per node, ``pi_i = |f_i|^2``: float64 ``[N]`` from ``[N]`` or ``[N, D]``; NaN stays NaN.
 

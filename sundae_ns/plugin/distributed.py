@@ -36,8 +36,7 @@ from sundae_ns.core.camera import Camera, camera_center
 from sundae_ns.core.errors import NOTHING_SAVED, ConfigError, passed_on
 from sundae_ns.core.gaussians import FEATURES, Gaussians
 from sundae_ns.core.surgery import change_parameter, per_gaussian
-from sundae_ns.rasterize.reference import BLUR, FOV_MARGIN
-from sundae_ns.scene.render import NEAR_PLANE, ColorSettings, GaussianSource, colors_from
+from sundae_ns.scene.render import ColorSettings, GaussianSource, colors_from, may_be_seen
 from sundae_ns.train.densification import COUNTED, start_counting
 from sundae_ns.train.exposure import ExposureCompensation
 from sundae_ns.train.state import Callback, TrainingState
@@ -83,33 +82,6 @@ def forward_signals() -> None:
 
 
 # --------------------------------------------------------------------------------------------------------- the exchange
-
-
-def may_be_seen(means: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> Tensor:
-    """Conservative visibility: True for all Gaussians that a backend renders, and some others; bool ``[R, N]``.
-
-    A backend culls a Gaussian whose distance from the image exceeds its radius, at most three standard deviations of
-    its footprint. With the largest scale s, the depth z and the slope k of a pixel, the Jacobian of the perspective map
-    has rows of length ``f / z * sqrt(1 + k^2)``, and k is clamped to the image and a margin. So the radius is at most
-    ``3 s C / z`` with one C per camera, plus the blur; multiplied by z, the test is linear in position and s.
-
-    Takes centres and logarithms of standard deviations ``[N, 3]``, world-to-camera transforms ``[R, 4, 4]``, and
-    intrinsics ``[R, 3, 3]`` and sizes ``[R, 2]`` in pixels.
-    """
-    off_axis = Ks[:, :2, 2] - sizes / 2
-    limit = off_axis.abs() + (0.5 + 0.5 * FOV_MARGIN) * sizes
-    # Slightly more than 3, for rounding.
-    reach = 3.003 * (Ks[:, :2, :2].square().sum(dim=(1, 2)) + limit.square().sum(dim=1)).sqrt()
-    # From the middle of the image: half the size, the blur, the rounding up of the radius, and a pixel for errors.
-    sides = torch.cat([Ks[:, :2], -Ks[:, :2]], dim=1)
-    sides[:, :, 2] = torch.cat([off_axis, -off_axis], dim=1) - (sizes / 2 + 3 * (2 * BLUR) ** 0.5 + 2).repeat(1, 2)
-    planes = sides @ viewmats[:, :3]  # [R, 4, 4]: how far beyond each side, times z
-    beyond = means @ planes[..., :3].flatten(0, 1).T + planes[..., 3].flatten()
-    allowed = scales.amax(dim=1).exp()[:, None, None] * reach[:, None]
-    depths = means @ viewmats[:, 2, :3].T + viewmats[:, 2, 3]
-    # NaN compares as visible in the sides, where backends disagree, but not in depth, where none renders it.
-    outside = (beyond.view(len(means), len(sizes), 4) > allowed).any(dim=2)
-    return ((depths >= NEAR_PLANE) & ~outside).T
 
 
 class ShardedSource(GaussianSource):

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import avg_pool2d
 
 from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.core.gaussians import as_gaussians, sh_to_rgb
@@ -86,14 +86,20 @@ def pixel_detail(image: Tensor, cells: float) -> Tensor:
     half = max(1, min(side, height, width) // 2)
     values = image.detach().nan_to_num().double()
     values = values - values[0, 0]  # a flat image has sums of exactly 0
-    values = torch.cat([values, values.square()], dim=2)
-    for _ in range(2):  # means of columns, then of rows: differences of running sums cost the same for every window
-        at = torch.arange(len(values), device=values.device)
-        low, high = (at - half).clamp_min(0), (at + half + 1).clamp_max(len(values))
-        sums = pad(values.cumsum(dim=0), (0, 0, 0, 0, 1, 0))
-        values = ((sums[high] - sums[low]) / (high - low)[:, None, None]).transpose(0, 1)
-    means, squares = values.chunk(2, dim=2)
-    variance = (squares - means.square()).clamp_min(0).sum(dim=2)
+    values = torch.cat([values, values.square().sum(dim=2, keepdim=True)], dim=2)
+    if values.device.type == "cpu":
+        import cv2  # takes a tenth of a second, also in commands that prune nothing
+
+        # By running sums. Those of another channel, of ones, count the pixels of a window within the image.
+        counted = torch.cat([values, torch.ones_like(values[..., :1])], dim=2).numpy()
+        sums = cv2.boxFilter(counted, -1, (2 * half + 1,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        values = torch.from_numpy(sums[..., :-1] / sums[..., -1:])
+    else:
+        for y, x in ((half, 0), (0, half)):  # columns, then rows
+            planes = values.permute(2, 0, 1)
+            planes = avg_pool2d(planes, (2 * y + 1, 2 * x + 1), 1, (y, x), count_include_pad=False)
+            values = planes.permute(1, 2, 0)
+    variance = (values[..., -1] - values[..., :-1].square().sum(dim=2)).clamp_min(0)
     mean = variance.mean()
     if not mean > 0:
         return torch.ones_like(variance).to(image.dtype)

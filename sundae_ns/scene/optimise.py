@@ -1,4 +1,4 @@
-"""The loop of every training outside of nerfstudio's: refit, distillation and fine-tune."""
+"""The loop of the trainings outside of nerfstudio's: distillation and fine-tune."""
 
 from __future__ import annotations
 

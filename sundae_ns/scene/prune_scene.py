@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterable, Sequence
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -23,12 +22,11 @@ from sundae_ns.graph.neighbors import knn
 from sundae_ns.pruning.decision import prune_gaussians
 from sundae_ns.pruning.rule import PruneRule, kept_count
 from sundae_ns.rasterize.interface import rasterize_cameras
-from sundae_ns.scene.optimise import optimise
 from sundae_ns.scene.render import GaussianSource, RenderSettings, TrainingCamera, contribution, pass_inputs
 from sundae_ns.scene.scene import Scene, measure, usable_cameras
 from sundae_ns.scene.virtual_cameras import by_device, of_unit_size, resized, size_of, split, virtual_cameras
 
-REFIT_STEPS, REFIT_VIEWS = {"cpu": 64, "cuda": 128}, 4  # steps of a refit by the device, and the images of each
+REFIT = {"cpu": (192, 1, 0.7), "cuda": (128, 4, 1.0)}  # steps of a refit, images of each, and factor of its rates
 REFIT_PIXELS, MOST_PIXELS = 1 << 18, 1 << 22  # most pixels of an image of a refit, and of one that tells what is seen
 
 
@@ -108,20 +106,21 @@ def prune_with_mask(
         count = kept_count(keep, n)
     assert count is not None
     usable = dataclasses.replace(scene, gaussians=sanitised.gaussians)
-    console = Console(stderr=True) if progress else None
+    console, images = Console(stderr=True) if progress else None, list[Tensor]()
     if not rule.uses_contribution or count >= n:
         weights = None
     else:
         given = cameras if cameras is not None else scene.cameras or virtual_cameras(usable)
         if weights is None:
-            weights = weights_in(usable, given, count if rule.uses_detail else None, console)
+            weights = weights_in(usable, given, count if rule.uses_detail else None, console, images if fit else None)
     pruned = prune_gaussians(sanitised.gaussians, rule, count, weights, graph)
     small = dataclasses.replace(scene, gaussians=pruned.gaussians)
     if weights is not None and rule.refits and fit:
         size, (full, scaled) = size_of(usable), of_unit_size(usable, given)
         scaled = [camera.to(scene.device) for camera in scaled]
         gaussians = resized(small, 1 / size).gaussians
-        fitted = refit(gaussians, full.gaussians, scaled, scene.settings(head=False), seed=rule.seed, console=console)
+        settings = scene.settings(head=False)
+        fitted = refit(gaussians, full.gaussians, scaled, settings, images=images, seed=rule.seed, console=console)
         fitted = resized(dataclasses.replace(scene, gaussians=fitted), size).gaussians
         small = dataclasses.replace(scene, gaussians=fitted)
     mask = within(sanitised.mask, pruned.decision.mask)
@@ -135,13 +134,19 @@ def at_most(camera: Camera, pixels: int) -> Camera:
 
 
 def weights_in(
-    scene: Scene, cameras: Sequence[Camera], count: int | None = None, console: Console | None = None
+    scene: Scene,
+    cameras: Sequence[Camera],
+    count: int | None = None,
+    console: Console | None = None,
+    images: list[Tensor] | None = None,
 ) -> Tensor:
     """Blending weight of each Gaussian of a finite scene ``[N]``, by :func:`.contribution`; ``DataError`` for none."""
+    if any(camera.width * camera.height > REFIT_PIXELS for camera in cameras):
+        images = None  # a refit reads smaller ones
     sized, scaled = of_unit_size(scene, [at_most(camera, MOST_PIXELS) for camera in cameras])
     views = [TrainingCamera(camera.to(scene.device), None) for camera in scaled]
     source, settings = GaussianSource(sized.gaussians), scene.settings(head=False)
-    weights = contribution(source, views, scene.background, settings, count, console=console)
+    weights = contribution(source, views, scene.background, settings, count, images=images, console=console)
     if not bool((weights > 0).any()):
         raise DataError(
             f"{len(scaled)} views see none of {scene.num_gaussians:,} Gaussians; "
@@ -157,6 +162,7 @@ def refit(
     cameras: Sequence[Camera],
     settings: RenderSettings,
     *,
+    images: Sequence[Tensor] = (),
     seed: int = 0,
     console: Console | None = None,
 ) -> Gaussians:
@@ -164,20 +170,20 @@ def refit(
 
     A merge keeps moments, not images. Adam's steps (Kingma and Ba, 2015) lower the squared error of the blended colours
     and of the accumulation, over a few images each, in an order by ``seed``. Returns ``small`` if it matches no worse.
+    ``images`` ``[H, W, 4]`` of ``full`` for all cameras are not rendered again.
     """
-    device = small["means"].device
+    steps, views, factor = by_device(REFIT, small["means"].device)
     cameras = [at_most(camera, REFIT_PIXELS) for camera in cameras]
     order = torch.randperm(len(cameras), generator=torch.Generator().manual_seed(seed)).tolist()
     # Eight cameras that no step uses judge, if there are twice as many.
     judges, trained = (order[:8], order[8:]) if len(order) >= 16 else (order, order)
-    images: dict[int, Tensor] = {}
+    truths = dict(enumerate(images))
     size = small["scales"].exp().sort(dim=1).values[:, 1:].mean(dim=1, keepdim=True)
     # The rates are the size of the first steps, for a prune to 15% or fewer; with more Gaussians less is left to fit.
     rates = {"means": 0.014, "scales": 0.007, "quats": 0.007, "opacities": 0.035, "features_dc": 0.014}
-    gentle = min(1.0, 0.15 * full.num_gaussians / small.num_gaussians)
+    factor *= min(1.0, 0.15 * full.num_gaussians / small.num_gaussians)
     moved = {name: torch.zeros_like(small[name], requires_grad=True) for name in rates}
-    groups = [{"params": [moved[name]], "lr": gentle * rate} for name, rate in rates.items()]
-    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
+    moments = {name: (torch.zeros_like(small[name]), torch.zeros_like(small[name])) for name in rates}
 
     def fitted() -> Gaussians:
         # Centres move in sizes of their Gaussian.
@@ -185,25 +191,23 @@ def refit(
 
     def error(gaussians: Gaussians, chosen: Sequence[int]) -> Tensor:
         """Sum of the mean squared errors of some cameras."""
-        new = [i for i in dict.fromkeys(chosen) if i not in images]
+        new = [i for i in dict.fromkeys(chosen) if i not in truths]
         with torch.no_grad():
-            images.update(zip(new, _blended(full, [cameras[i] for i in new], settings), strict=True))
+            truths.update(zip(new, _blended(full, [cameras[i] for i in new], settings), strict=True))
         rendered = zip(_blended(gaussians, [cameras[i] for i in chosen], settings), chosen, strict=True)
-        return torch.stack([(image - images[i]).square().mean() for image, i in rendered]).sum()
+        return torch.stack([(image - truths[i]).square().mean() for image, i in rendered]).sum()
 
-    def step(i: int) -> None:
-        chosen = [trained[k % len(trained)] for k in range(i * REFIT_VIEWS, (i + 1) * REFIT_VIEWS)]
-        for some in [chosen] if device.type == "cuda" else [[k] for k in chosen]:  # a GPU takes small images together
-            with torch.enable_grad():
-                error(fitted(), some).backward()
-        optimizer.step()
-        optimizer.zero_grad(set_to_none=True)
-
-    steps = by_device(REFIT_STEPS, device)
     with Progress(transient=True, console=console, disable=console is None) as progress:
-        task = progress.add_task("Refit of Gaussians", total=steps)
-        show = partial(progress.advance, task)
-        optimise(step, {"field": optimizer}, steps, lambda _, i: 1 - i / steps, on_step=lambda _: show())
+        for i in progress.track(range(steps), description="Refit of Gaussians"):
+            with torch.enable_grad():
+                loss = error(fitted(), [trained[k % len(trained)] for k in range(i * views, (i + 1) * views)])
+            # Adam written out: torch.optim imports a compiler, which takes two seconds.
+            for name, gradient in zip(moved, torch.autograd.grad(loss, list(moved.values())), strict=True):
+                mean, square = moments[name]
+                mean.lerp_(gradient, 0.1)
+                square.lerp_(gradient.square(), 0.01)
+                rate = factor * rates[name] * (1 - i / steps) / (1 - 0.9 ** (i + 1))
+                moved[name] -= rate * mean / ((square / (1 - 0.99 ** (i + 1))).sqrt() + 1e-15)
     gaussians = fitted()
     before, after = (error(each, judges) for each in (small, gaussians))
     return gaussians if bool(after < before) else small  # small too if the fitted ones are not finite

@@ -15,6 +15,7 @@ from sundae_ns.core.gaussians import FEATURES, Gaussians
 from sundae_ns.head.head import CompensationHead, ScalePlan, plan, resize
 from sundae_ns.pruning.scores import pixel_detail
 from sundae_ns.rasterize.interface import blending_weights, harmonic_colors, rasterize
+from sundae_ns.rasterize.reference import BLUR, FOV_MARGIN
 from sundae_ns.rasterize.types import Backend, Inputs, Rasterization, check_memory
 
 if TYPE_CHECKING:
@@ -190,6 +191,30 @@ def render_view(
     return images, splatted
 
 
+def may_be_seen(means: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> Tensor:
+    """Conservative visibility: True for all Gaussians that a backend renders, and some others; bool ``[R, N]``.
+
+    With the largest scale s, the depth z and the slope k of a pixel, clamped to the image and a margin, the Jacobian of
+    the perspective map has rows of length ``f / z * sqrt(1 + k^2)``. So a radius is at most ``3 s C / z`` with one C
+    per camera, plus the blur. Takes centres and logarithms of standard deviations ``[N, 3]``, world-to-camera
+    transforms ``[R, 4, 4]``, and intrinsics ``[R, 3, 3]`` and sizes ``[R, 2]`` in pixels.
+    """
+    off_axis = Ks[:, :2, 2] - sizes / 2
+    limit = off_axis.abs() + (0.5 + 0.5 * FOV_MARGIN) * sizes
+    # Slightly more than 3, for rounding.
+    reach = 3.003 * (Ks[:, :2, :2].square().sum(dim=(1, 2)) + limit.square().sum(dim=1)).sqrt()
+    # From the middle of the image: half the size, the blur, the rounding up of the radius, and a pixel for errors.
+    sides = torch.cat([Ks[:, :2], -Ks[:, :2]], dim=1)
+    sides[:, :, 2] = torch.cat([off_axis, -off_axis], dim=1) - (sizes / 2 + 3 * (2 * BLUR) ** 0.5 + 2).repeat(1, 2)
+    planes = sides @ viewmats[:, :3]  # [R, 4, 4]: how far beyond each side, times z
+    beyond = means @ planes[..., :3].flatten(0, 1).T + planes[..., 3].flatten()
+    allowed = scales.amax(dim=1).exp()[:, None, None] * reach[:, None]
+    depths = means @ viewmats[:, 2, :3].T + viewmats[:, 2, 3]
+    # NaN compares as visible in the sides, where backends disagree, but not in depth, where none renders it.
+    outside = (beyond.view(len(means), len(sizes), 4) > allowed).any(dim=2)
+    return ((depths >= NEAR_PLANE) & ~outside).T
+
+
 @torch.no_grad()
 def contribution(
     source: GaussianSource,
@@ -198,12 +223,14 @@ def contribution(
     settings: RenderSettings,
     count: int | None = None,
     *,
+    images: list[Tensor] | None = None,
     console: Console | None = None,
 ) -> Tensor:
     """Blending weight of each Gaussian over a fixed background, summed over the pixels of all views ``[N]``.
 
     With ``count``, the number of Gaussians that a prune will keep, pixels are weighted by the detail that these cannot
-    show (:func:`.pixel_detail`). ``DataError`` if a mask has another size than its view.
+    show (:func:`.pixel_detail`), and blended colours and accumulation of each view, float16 ``[H, W, 4]``, are appended
+    to ``images``. ``DataError`` if a mask has another size than its view.
     """
     total = source.gaussians["means"].new_zeros(source.gaussians.num_gaussians)
     tracked: Iterable[TrainingCamera] = cameras
@@ -215,31 +242,27 @@ def contribution(
         if mask is not None and tuple(mask.shape) != (camera.height, camera.width, 1):
             size = f"{camera.width} x {camera.height}"
             raise DataError(f"a mask is {list(mask.shape)} but its view is {size} px; give masks of their images' size")
-        primitives = source.primitives(camera, settings, features=False, colors=count is not None)
+        seen, rows = source, None
+        if total.device.type == "cpu":  # a GPU culls faster than it picks rows
+            view = camera.viewmat[None], camera.K[None], torch.tensor([[camera.width, camera.height]])
+            (rows,) = may_be_seen(source.gaussians["means"], source.gaussians["scales"], *view)
+            seen = GaussianSource(source.gaussians.rows(rows))
+        primitives = seen.primitives(camera, settings, features=False, colors=count is not None)
         pixels = None if mask is None else mask[..., 0].to(total)
         if count is None:
-            total += blending_weights(pass_inputs(primitives, camera, settings), pixels, backend=settings.backend)
+            weights = blending_weights(pass_inputs(primitives, camera, settings), pixels, backend=settings.backend)
         else:
-            share = count / source.total
-            total += _detail_weights(primitives, camera, background.to(total.device), settings, share, pixels)
+            # As in blending_weights, but one pass gives the image and the weights: the gradient of the first channel.
+            fixed = {name: value.detach() for name, value in primitives.items()}
+            colors = fixed["colors"].requires_grad_()
+            with torch.enable_grad():
+                drawn, splatted = draw(fixed, camera, background.to(total), settings.without_head(), depth=False)
+                # A prune keeps the same share of the visible Gaussians as of all.
+                cells = count / source.total * float((splatted.radii > 0).sum())
+                detail = pixel_detail(drawn["base_rgb"].detach(), cells)
+                blended = (splatted.colors[..., 0] * (detail if pixels is None else detail * pixels)).sum()
+            weights = torch.autograd.grad(blended, colors)[0][:, 0]
+            if images is not None:
+                images.append(torch.cat([splatted.colors.detach(), splatted.alpha.detach()], dim=2).half())
+        total[... if rows is None else rows] += weights
     return total
-
-
-def _detail_weights(
-    primitives: Mapping[str, Tensor],
-    camera: Camera,
-    background: Tensor,
-    settings: RenderSettings,
-    share: float,
-    pixels: Tensor | None,
-) -> Tensor:
-    """Blending weights ``[M]`` over pixels weighted by their detail, and by ``pixels`` ``[H, W]``."""
-    # As in blending_weights, but one pass gives the image and the weights: the gradient of the first channel.
-    fixed = {name: value.detach() for name, value in primitives.items()}
-    fixed["colors"].requires_grad_()
-    with torch.enable_grad():
-        images, splatted = draw(fixed, camera, background, settings.without_head(), depth=False)
-        # A prune keeps the same share of the visible Gaussians as of all.
-        detail = pixel_detail(images["base_rgb"].detach(), share * float((splatted.radii > 0).sum()))
-        blended = (splatted.colors[..., 0] * (detail if pixels is None else detail * pixels)).sum()
-    return torch.autograd.grad(blended, fixed["colors"])[0][:, 0]

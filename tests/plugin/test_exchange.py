@@ -19,12 +19,12 @@ from sundae_ns.core.camera import Camera
 from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.core.surgery import keep
 from sundae_ns.head.head import CompensationHead, HeadConfig
-from sundae_ns.plugin.distributed import BatchOptimizers, Ranks, ShardedSource, _summed, may_be_seen
+from sundae_ns.plugin.distributed import BatchOptimizers, Ranks, ShardedSource, _summed
 from sundae_ns.plugin.optimizer_configs import FusedAdamConfig
 from sundae_ns.rasterize.interface import rasterize, select_backend
 from sundae_ns.rasterize.reference import project
 from sundae_ns.rasterize.types import Inputs
-from sundae_ns.scene.render import ColorSettings, GaussianSource
+from sundae_ns.scene.render import ColorSettings, GaussianSource, may_be_seen
 from sundae_ns.train.exposure import ExposureCompensation
 from sundae_ns.train.state import Callback, TrainingState
 

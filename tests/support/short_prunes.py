@@ -7,7 +7,7 @@ import pytest
 STEPS, VIEWS, SIDE = 4, 8, 64
 SHORT = f"""
 from sundae_ns.scene import prune_scene as pruning, virtual_cameras as virtual
-pruning.REFIT_STEPS["cpu"], virtual.VIEWS["cpu"], virtual.SIDE = {STEPS}, {VIEWS}, {SIDE}
+pruning.REFIT["cpu"], virtual.VIEWS["cpu"], virtual.SIDE = ({STEPS}, 4, 1.0), {VIEWS}, {SIDE}
 """
 """What the fixture does, as lines of a program of its own."""
 
@@ -18,7 +18,7 @@ def short_prunes(monkeypatch: pytest.MonkeyPatch) -> None:
     from sundae_ns.scene import prune_scene as pruning
     from sundae_ns.scene import virtual_cameras as virtual
 
-    monkeypatch.setitem(pruning.REFIT_STEPS, "cpu", STEPS)
+    monkeypatch.setitem(pruning.REFIT, "cpu", (STEPS, 4, 1.0))
     monkeypatch.setitem(virtual.VIEWS, "cpu", VIEWS)
     monkeypatch.setattr(virtual, "SIDE", SIDE)
 
