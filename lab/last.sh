@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Tests of a GPU, and trainings by the default: *bonsai*, *courtyard* by three seeds, captures of 24 views; on four GPUs.
+# Tests of a GPU, trainings by the default (*bonsai*, *courtyard* by three seeds), and asked sizes; on four GPUs.
 # last.sh queue PART (carry .gpu/pPART), last.sh wait SECONDS
 set -u
 H=$PWD
@@ -18,13 +18,18 @@ if [ $1 = queue ]; then
   fi
   [ -f /tmp/logs/queue.log ] || { echo "part 1 has not run here: give the machine back"; exit 3; }
   touch /tmp/logs/part$2
-  for c in $H/.gpu/p$2/scenes/* $H/.gpu/p$2/cuts/*; do
+  for c in $H/.gpu/p$2/scenes/*; do
     [ -d $c ] || continue; n=$(basename $c); cp -r $c /tmp/scenes/
     case $n in
-      courtyard) for k in 42 43 44; do arm 10 $n default$k $k 2; done;;
-      bonsai) arm 10 $n default42 42 1;;
-      *) arm 20 $n default42 42 3;;
+      courtyard)
+        for k in 42 43 44; do arm 10 $n default$k $k 2; done
+        for m in 0.25 1 4; do on 11-size-$n-$m "# gpu $([ $m = 1 ] && echo 2 || echo 1)" "cd /tmp; python3 $R/benchmarks/sizes_asked.py /tmp/scenes/$n --sizes $m -o $O/sizes-$n-$m.csv"; done;;
+      *) arm 10 $n default42 42 1;;
     esac
+  done
+  for f in $H/.gpu/p$2/fields/*.sog; do
+    [ -f $f ] || continue; n=$(basename $f .sog); cp $f $H/.gpu/p$2/fields/$n.cameras.json /tmp/scenes/
+    on 12-size-$n "# gpu $([ $n = fox ] && echo 1 || echo 3)" "cd /tmp; python3 $R/benchmarks/sizes_asked.py /tmp/scenes/$n.sog -o $O/sizes-$n.csv"
   done
   ls $J | wc -l; tail -n 5 /tmp/logs/queue.log
 else
@@ -32,6 +37,6 @@ else
   until grep -q "all done" /tmp/logs/queue.log || [ $SECONDS -gt $2 ]; do sleep 1; done
   cat /tmp/few/*/result.json > $O/few.jsonl
   (cd /tmp/few; find . -name trials.json | tar -czf $O/trials.tgz -T -)
-  tar -czf $OUT/out.tgz -C /tmp out/few.jsonl out/trials.tgz logs
+  tar -czf $OUT/out.tgz -C /tmp out logs
   awk '/done/' /tmp/logs/queue.log | tail -n 30; grep -l Traceback /tmp/logs/*.log; wc -l $O/few.jsonl; cut -c1-300 /tmp/logs/05-pytest.log
 fi
