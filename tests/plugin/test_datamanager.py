@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
@@ -148,12 +148,12 @@ def test_point_cloud_needs_no_open3d(still_life, load, monkeypatch):
     assert outputs.metadata["points3D_rgb"].dtype == torch.uint8
 
 
-def cameras(*, focal=20.0, mirrored=False, spread=1.0, outlier=0.0):
+def cameras(*, focal=20.0, mirrored=False, spread=1.0, outlier=0.0, kind=CameraType.PERSPECTIVE):
     poses = torch.eye(4)[None, :3].repeat(6, 1, 1)
     poses[:, :, 3] = spread * torch.randn(6, 3, generator=torch.Generator().manual_seed(0))
     poses[4, 0, 0] = -1.0 if mirrored else 1.0
     poses[4, 0, 3] += outlier
-    return Cameras(poses, fx=focal, fy=focal, cx=10.0, cy=8.0, width=20, height=16)
+    return Cameras(poses, fx=focal, fy=focal, cx=10.0, cy=8.0, width=20, height=16, camera_type=kind)
 
 
 NAMES = [Path(f"{index}.png") for index in range(6)]
@@ -162,6 +162,7 @@ NAMES = [Path(f"{index}.png") for index in range(6)]
 @pytest.mark.parametrize(
     ("options", "cause"),
     [
+        ({"kind": CameraType.VR180_L}, r"camera of 0\.png is of type VR180_L, .*such as cube faces"),
         ({"mirrored": True}, r"pose of 4\.png mirrors an axis \(1 of 6"),
         ({"focal": 1e-5}, r"focal length of 0\.png is 1e-05 px and the image is 20 px wide"),
         ({"focal": 1e9}, r"no lens has; give it in pixels"),
