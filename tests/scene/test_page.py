@@ -97,7 +97,7 @@ def test_a_page_of_two_scenes_with_named_views(packed, scene, tmp_path):
     found = dict(re.findall(r'data-name="(\w+)" data-source="([\w.]+)"', index))
     assert found == {"one": "scene.sundae", "two": "scene1.sundae"}
     assert sn.load(tmp_path / "both" / "scene1.sundae").num_gaussians == len(scene[::2])
-    (named,) = re.findall(r'id="named">(.*)</script>', index)
+    (named,) = re.findall(r'id="named">(.*?)</script>', index)
     links = dict(json.loads(named))
     assert [links["a </script>"], links["c"]] == ["#camera=2"] * 2
     *center, x, y, z, lens = map(float, links["b"].removeprefix("#camera=").split(","))
