@@ -27,9 +27,9 @@ COLUMNS = ("field", "kind", "planted", "removed", "others_removed", "psnr_lost")
 
 def points_in_front(
     scene: sn.Scene, cameras: Sequence[sn.Camera], generator: torch.Generator, low: float, high: float
-) -> Tensor:
-    """Random points between cameras and what they see ``[PLANTED, 3]``, at shares of the depth."""
-    points, depths = [], [sn.render(scene, camera).depth[..., 0] for camera in cameras]
+) -> tuple[Tensor, Tensor]:
+    """Random points between cameras and what they see ``[PLANTED, 3]``, at shares of the depth, and their depths."""
+    points, zs, depths = [], [], [sn.render(scene, camera).depth[..., 0] for camera in cameras]
     for i in range(PLANTED):
         camera, depth = cameras[i % len(cameras)], depths[i % len(cameras)]
         row, column = (int(torch.randint(n, (1,), generator=generator)) for n in depth.shape)
@@ -37,7 +37,8 @@ def points_in_front(
         K, viewmat = camera.K, camera.viewmat
         ray = torch.stack([(column + 0.5 - K[0, 2]) / K[0, 0], (row + 0.5 - K[1, 2]) / K[1, 1], torch.ones(())])
         points.append(viewmat[:3, :3].T @ (z * ray - viewmat[:3, 3]))
-    return torch.stack(points).float()
+        zs.append(z)
+    return torch.stack(points).float(), torch.tensor(zs)[:, None]
 
 
 def planted(scene: sn.Scene, kind: str, cameras: Sequence[sn.Camera], seed: int) -> sn.Scene:
@@ -54,14 +55,14 @@ def planted(scene: sn.Scene, kind: str, cameras: Sequence[sn.Camera], seed: int)
     chosen = torch.randint(len(distances), (PLANTED,), generator=generator)
     directions = torch.nn.functional.normalize(torch.randn(PLANTED, 3, generator=generator), dim=1)
     if kind == "near":
-        means, opacities = points_in_front(scene, cameras, generator, 0.1, 0.4), random(0.3, 0.99)
-        scales = reach * random(0.01, 0.05) * random(0.5, 1.5, 3)
+        (means, depths), opacities = points_in_front(scene, cameras, generator, 0.1, 0.4), random(0.3, 0.99)
+        scales = depths * random(0.01, 0.1) * random(0.5, 1.5, 3)
     elif kind == "shell":
         means, opacities = middle.float() + directions * outer * random(1, 3), random(0.3, 0.99)
         scales = outer * 0.02 * random(0.5, 1.5, 3)
     elif kind == "haze":
-        means, opacities = points_in_front(scene, cameras, generator, 0.3, 0.7), random(0.03, 0.13)
-        scales = reach * random(0.1, 0.2) * random(0.5, 1.5, 3)
+        (means, depths), opacities = points_in_front(scene, cameras, generator, 0.3, 0.7), random(0.03, 0.13)
+        scales = depths * random(0.1, 0.3) * random(0.5, 1.5, 3)
     else:
         means, opacities = gaussians["means"][chosen], random(0.5, 0.99)
         scales = reach * torch.cat([random(0.2, 0.4), random(0.002, 0.006, 2)], dim=1)
@@ -78,7 +79,7 @@ def rows_of(path: Path) -> Iterator[tuple[object, ...]]:
     dirty = scene
     for seed, kind in enumerate(KINDS):
         dirty = planted(dirty, kind, cameras, seed)
-    n = len(floats := floater_mask(dirty, ())) - PLANTED * len(KINDS)
+    n = len(floats := floater_mask(dirty, (), 0.5)) - PLANTED * len(KINDS)
     psnr = sn.measure(scene[~floats[:n]], scene, cameras).psnr
     lost = f"{10 * math.log10(1 + 10 ** (-psnr / 10) / 1e-3):.3f}"
     for kind, part in zip(KINDS, floats[n:].split(PLANTED), strict=True):

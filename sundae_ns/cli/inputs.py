@@ -73,7 +73,7 @@ def opened(
 ) -> Left:
     """A scene before its wishes, upright and started as its details say; ``capture`` asks for cameras of a run."""
     rows = None
-    if is_run(source) and (capture or wishes.remove_floaters or details.data is not None):
+    if is_run(source) and (capture or wishes.remove_floaters is not None or details.data is not None):
         scene = open_run(source, data=details.data)
     else:
         scene, rows = load_with_mask(source)
@@ -111,8 +111,8 @@ def reduced(
             mask = crop_mask(scene, wishes.crop[:3], wishes.crop[3:])
             print(f"{int(mask.sum()):,} of {len(mask):,} Gaussians are in the box", file=sys.stderr)
             scene, rows = scene[mask], None if rows is None else within(rows, mask.cpu())
-        if wishes.remove_floaters:
-            mask = ~floater_mask(scene, cameras, console=Console(stderr=True))
+        if wishes.remove_floaters is not None:
+            mask = ~floater_mask(scene, cameras, wishes.remove_floaters, Console(stderr=True))
             why = "" if cameras else ", by their neighbours alone: no camera of the photographs is known"
             print(f"removed {int((~mask).sum()):,} floaters of {len(mask):,} Gaussians{why}", file=sys.stderr)
             if not bool(mask.any()):

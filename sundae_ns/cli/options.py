@@ -75,20 +75,20 @@ class Wishes:
     crop: Maybe[tuple[float, float, float, float, float, float]] = None
     """keep the Gaussians whose centres are in this box: its lowest x y z, then its highest, in the coordinates of the
     file."""
-    remove_floaters: Flag = False
-    """remove small groups of Gaussians that touch no other, and what none of the cameras of the photographs sees."""
+    remove_floaters: Annotated[Maybe[float], tyro.conf.arg(metavar="[0 to 1]")] = None
+    """remove what floats, and what no camera of the photographs sees: from 0, what surely does, to 1; bare 0.5."""
 
     def check_wishes(self, **others: object) -> None:
         """Raise ``ConfigError`` for more than one amount, ``others`` included, or one that is out of range."""
         check_exclusive(keep=self.keep, count=self.count, max_mb=self.max_mb, **others)
         if self.keep is not None and not 0 < self.keep <= 1:
             raise ConfigError(f"keep is {self.keep}; give a share in (0, 1], or per cent as 25%")
-        check_least(count=(self.count, 1), max_mb=(self.max_mb, 0.001))
+        check_least(count=(self.count, 1), max_mb=(self.max_mb, 0.001), remove_floaters=(self.remove_floaters, 0))
 
     @property
     def cleans(self) -> str:
         """Name of the first option that cuts Gaussians by their place, or empty."""
-        floaters = "--remove-floaters" if self.remove_floaters else ""
+        floaters = "" if self.remove_floaters is None else "--remove-floaters"
         return floaters if self.crop is None else "--crop"
 
     @property
@@ -136,12 +136,9 @@ def words_of(options: object, *names: str) -> list[str]:
         if value is True:
             words.append(flag)
         elif value is not None and value is not False:
-            words += [flag, *(f"{each:g}" if isinstance(each, float) else str(each) for each in _listed(value))]
+            values = value if isinstance(value, tuple) else (value,)
+            words += [flag, *(f"{each:g}" if isinstance(each, float) else str(each) for each in values)]
     return words
-
-
-def _listed(value: object) -> tuple[object, ...]:
-    return value if isinstance(value, tuple) else (value,)
 
 
 def progress_bar() -> Progress:

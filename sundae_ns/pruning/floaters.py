@@ -1,4 +1,4 @@
-"""Gaussians right in front of a camera, where the scene has nothing.
+"""Floaters: Gaussians right in front of a camera where the scene has nothing, and those unlike what is around them.
 
 A Gaussian that is near enough to one camera can explain what differs between its photo and the others, and covers much
 of the images of cameras beside it (such floaters are described by Philip and Deschaintre, "Floaters No More", 2023).
@@ -7,14 +7,18 @@ The sparse points of structure from motion say how near the scene comes to the c
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
+from sundae_ns.core.gaussians import Gaussians, sh_to_rgb
+from sundae_ns.graph.neighbors import knn
+
 NEAREST = 0.01  # Share of the sparse points that may be nearer to a camera than the scene: some of them are wrong
 FREE = 2 / 3  # share of that distance which is taken to be empty
+# Something near has this many sparse points within this share of the empty distance; wrong points lie alone.
 SUPPORT, REACH = 3, 0.5
-"""A Gaussian is no floater if this many sparse points are within this share of the empty distance from it: a few
-photos may be of something near. Wrong points lie alone."""
 MOST = 0.05  # Largest share that can be floaters; with more of them the points do not say where the scene is
 
 
@@ -42,3 +46,30 @@ def near_cameras(means: Tensor, eyes: Tensor, points: Tensor) -> Tensor:
     about = finite[distances < (1 + REACH) * free]
     near[near.clone()] = _distances(means[near], about, SUPPORT) > REACH * free
     return near
+
+
+@torch.no_grad()
+def floater_odds(gaussians: Gaussians) -> Tensor:
+    """Logarithm of the odds that a Gaussian of a finite field floats, by its 16 nearest, float64 ``[N]``.
+
+    Balls in the air or of other colours, and long needles; weights by logistic regression (``benchmarks/cleaning.py``).
+    """
+    n, means = gaussians.num_gaussians, gaussians["means"].detach().double()
+    if n < 2:
+        return means.new_full((n,), -torch.inf)
+    near = knn(means, min(16, n - 1))
+    away = (means - means.median(dim=0).values).norm(dim=1)
+    reach = away.median() or away.mean()
+    short, middle, long = (gaussians["scales"].detach().double() - reach.log()).sort(dim=1).values.unbind(dim=1)
+    gaps = (near.distances[:, [min(3, n - 2), -1]] / reach).clamp_min(1e-9).log() - long[:, None]
+    larger = (long[:, None] - long[near.indices]).median(dim=1).values
+    colors = sh_to_rgb(gaussians.as_harmonics()["features_dc"].detach()).clamp(0, 1)
+    around = colors[near.indices]
+    usual = around.median(dim=1).values
+    unlike = (colors - usual).abs().amax(dim=1).clamp_max(0.4)  # in the channel that differs most
+    mixed = (around - usual[:, None]).abs().amax(dim=2).median(dim=1).values.clamp_max(0.4)
+    ball = 11.5 * unlike + 5 * mixed + 0.9 * larger + 1.3 * long + 2 * (short - long).clamp_min(-4) + 0.4
+    ball += 1.2 * gaps[:, 0].clamp(-2, 4) + gaps[:, 1].clamp(-1, 4) - 1.9 * (away / reach).log().clamp_min(0)
+    ball += 3 * (1 - 5 * gaussians["opacities"].detach()[:, 0].sigmoid()).clamp_min(0)  # haze
+    odds = torch.where(long - middle > math.log(10), 14 * unlike + 2 * larger - 7.5, ball)
+    return odds - 5 * (long + math.log(2)).clamp_min(0)  # what is larger than half the scene is its background

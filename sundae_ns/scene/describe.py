@@ -82,7 +82,7 @@ def describe(
         "bytes_by_attribute": bytes_by_attribute(scene, path),
         "seen_by": f"{len(views)} {'cameras' if cameras else 'virtual cameras'}",
         "invisible": float((weights <= 0).float().mean()),
-        "floaters": int((floater_mask(scene, ()) | ((weights <= 0) & bool(cameras))).sum()),
+        "floaters": int((floater_mask(scene, (), 0.5) | ((weights <= 0) & bool(cameras))).sum()),
         "crop": box_of(means, weights),
     }
 

@@ -91,7 +91,7 @@ def late_outputs(
     def depth() -> Tensor:
         splatted = splat(drawn, camera, drawn["opacities"], settings, render_depth=True).depth
         assert splatted is not None
-        return fill_depth(splatted, alpha)
+        return torch.where(alpha > 0, splatted, splatted.max())  # empty pixels are farthest
 
     def features() -> Tensor:
         if settings.head is None:
@@ -115,11 +115,6 @@ def empty_outputs(width: int, height: int, background: Tensor) -> dict[str, Any]
     zeros = background.new_zeros(height, width, 1)
     images = (image, image, zeros + 10, zeros, background.new_zeros(height, width, 3), zeros)
     return {**dict(zip(OUTPUTS, images, strict=True)), "background": image}
-
-
-def fill_depth(depth: Tensor, alpha: Tensor) -> Tensor:
-    """Depth ``[H, W, 1]`` with the largest rendered depth in pixels where ``alpha`` is 0."""
-    return torch.where(alpha > 0, depth, depth.max())
 
 
 def principal_components(features: Tensor) -> tuple[Tensor, Tensor, Tensor]:

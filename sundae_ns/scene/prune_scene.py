@@ -18,8 +18,8 @@ from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.core.gaussians import Gaussians, sanitise
 from sundae_ns.core.values import AnyArray, numbers, whole
 from sundae_ns.graph.graph import NeighborGraph
-from sundae_ns.graph.neighbors import knn
 from sundae_ns.pruning.decision import prune_gaussians
+from sundae_ns.pruning.floaters import floater_odds
 from sundae_ns.pruning.rule import PruneRule, kept_count
 from sundae_ns.rasterize.interface import rasterize_cameras
 from sundae_ns.scene.render import GaussianSource, RenderSettings, TrainingCamera, contribution, pass_inputs
@@ -215,10 +215,8 @@ def refit(
 
 def _blended(gaussians: Gaussians, cameras: Sequence[Camera], settings: RenderSettings) -> list[Tensor]:
     """Blended colours and accumulation for each camera, without background ``[H, W, 4]``."""
-    if len({(camera.width, camera.height) for camera in cameras}) > 1:
+    if len({(camera.width, camera.height) for camera in cameras}) != 1:
         return [image for camera in cameras for image in _blended(gaussians, [camera], settings)]
-    if not cameras:
-        return []
     primitives = [GaussianSource(gaussians).primitives(camera, settings, features=False) for camera in cameras]
     colors = torch.stack([each["colors"] for each in primitives])
     # What blends to the accumulation is 1 everywhere.
@@ -236,8 +234,6 @@ def count_for_drop(
     The scene is pruned to a half, a quarter and so on, until every eighth camera, held out, sees too much difference.
     The error adds to that of the full scene against photographs, which is taken to be that of 30 dB.
     """
-    if not 0 < drop < 100:
-        raise ConfigError(f"target-drop is {drop}; give a positive number of dB, 0.5 for half a decibel")
     if len(cameras) < 2:
         raise ConfigError("a target needs two views or more, because one of them is held out; give more views")
     scene, cameras = of_unit_size(scene, cameras)
@@ -259,9 +255,6 @@ def count_for_drop(
     return n, curve
 
 
-REACH = 3.0  # Gaussians touch if they are nearer than this many times the sum of their largest standard deviations
-
-
 def crop(scene: Scene, low: AnyArray, high: AnyArray) -> Scene:
     """The Gaussians whose centres are in a box, its faces included; everything else of the scene stays.
 
@@ -281,24 +274,24 @@ def crop(scene: Scene, low: AnyArray, high: AnyArray) -> Scene:
     return scene[crop_mask(scene, low, high)]
 
 
-def remove_floaters(scene: Scene, *, cameras: Camera | Iterable[Camera] | None = None) -> Scene:
-    """The scene without small groups of Gaussians that touch no other, and without what no camera sees.
+def remove_floaters(scene: Scene, strength: float = 0.5, *, cameras: Camera | Iterable[Camera] | None = None) -> Scene:
+    """The scene without what floats in the air or sticks out of it, and without what no camera sees.
 
     Args:
         scene: to clean; it does not change.
-        cameras: cameras of the photographs; by default those stored with the scene. Without any, groups alone count.
+        strength: from 0, only what is certain to float, to 1, all that may; see :func:`.floater_odds`.
+        cameras: cameras of the photographs; by default those stored with the scene. Without any, neighbours decide.
 
     Raises:
+        ConfigError: the strength is not from 0 to 1.
         DataError: no Gaussian is finite, or the cameras see none.
 
     >>> import torch, sundae_ns as sn
-    >>> points = torch.cat([torch.rand(2000, 3), torch.tensor([[9.0, 9.0, 9.0]])])
-    >>> scene = sn.Scene.from_points(points, torch.rand(2001, 3))
-    >>> gaussians = scene.gaussians.replaced({"scales": scene.gaussians["scales"].clamp(max=-3)})
-    >>> sn.remove_floaters(sn.Scene(gaussians)).num_gaussians < 2001
+    >>> scene = sn.Scene.from_points(torch.rand(2000, 3), torch.full((2000, 3), 0.5))
+    >>> sn.remove_floaters(scene).num_gaussians > 1900
     True
     """
-    return scene[~floater_mask(scene, scene.cameras if cameras is None else usable_cameras(cameras))]
+    return scene[~floater_mask(scene, scene.cameras if cameras is None else usable_cameras(cameras), strength)]
 
 
 def within(mask: Tensor | None, inner: Tensor) -> Tensor:
@@ -323,43 +316,24 @@ def crop_mask(scene: Scene, low: AnyArray, high: AnyArray) -> Tensor:
         finite = means[means.isfinite().all(dim=1)].cpu().numpy()
         if not len(finite):
             raise DataError("no Gaussian is in the box, because none is finite; export the scene again")
-        quantiles = np.quantile(finite, (0.05, 0.95), axis=0)
         digits = 3 if scene.offset is None else 10
-        corners = (" ".join(f"{value:.{digits}g}" for value in corner) for corner in quantiles)
+        corners = (
+            " ".join(f"{value:.{digits}g}" for value in corner) for corner in np.quantile(finite, (0.05, 0.95), axis=0)
+        )
         raise DataError(f"no Gaussian is in the box; most of them lie between {' and '.join(corners)}")
     return inside
 
 
 @torch.no_grad()
-def floater_mask(scene: Scene, cameras: Sequence[Camera], *, console: Console | None = None) -> Tensor:
+def floater_mask(scene: Scene, cameras: Sequence[Camera], strength: float, console: Console | None = None) -> Tensor:
     """True for floaters, bool ``[N]``; arguments and errors as for :func:`remove_floaters`."""
+    if not 0 <= strength <= 1:
+        raise ConfigError(f"the strength of remove-floaters is {strength}; give 0 (careful) to 1 (thorough)")
     sanitised = sanitise(scene.gaussians)
     if not sanitised.gaussians.num_gaussians:
         raise DataError("no Gaussian is finite; export the scene again")
-    usable = dataclasses.replace(scene, gaussians=sanitised.gaussians)
-    floats = _unsupported(usable)
+    floats = floater_odds(sanitised.gaussians) > 6.5 - 5 * strength  # logarithms
     if cameras:
         small = [camera.zoomed(min(512 / max(camera.width, camera.height), 1.0)) for camera in cameras]
-        floats |= weights_in(usable, small, console=console) <= 0
-    mask = ~sanitised.mask
-    mask[sanitised.mask] = floats
-    return mask
-
-
-def _unsupported(scene: Scene) -> Tensor:
-    """True for Gaussians of small groups that touch no other one, bool ``[N]``."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    n = scene.num_gaussians
-    if n <= 1:
-        return torch.zeros(n, dtype=torch.bool, device=scene.device)
-    near = knn(scene.gaussians["means"].detach(), min(16, n - 1))
-    reach = REACH * scene.gaussians["scales"].detach().amax(dim=1).exp()
-    touching = near.distances < reach[:, None] + reach[near.indices]
-    rows = torch.arange(n, device=scene.device)[:, None].expand_as(touching)[touching].cpu().numpy()
-    columns = near.indices[touching].cpu().numpy()
-    graph = coo_matrix((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(n, n))
-    groups = connected_components(graph, directed=False)[1]
-    small = np.bincount(groups) <= max(1, min(30, n // 1000))
-    return torch.from_numpy(small[groups]).to(scene.device)
+        floats |= weights_in(dataclasses.replace(scene, gaussians=sanitised.gaussians), small, console=console) <= 0
+    return ~within(sanitised.mask, ~floats)

@@ -37,15 +37,17 @@ def planted(n=30):
 @pytest.mark.parametrize("with_views", [True, False])
 def test_planted_floaters_vanish_and_the_surface_stays(factor, with_views):
     floaters, surface = planted(), wall()
-    whole = scene_of(factor * torch.cat([surface, floaters]), factor * 0.02)
+    whole = scene_of(torch.cat([surface, floaters]), 0.02)
+    whole.gaussians["means"] *= factor
+    whole.gaussians["scales"] += math.log(factor)
     cameras = [camera._replace(viewmat=camera.viewmat.clone()) for camera in VIEWS]
     for camera in cameras:
         camera.viewmat[:3, 3] *= factor
-    found = floater_mask(whole, cameras if with_views else ())
+    found = floater_mask(whole, cameras if with_views else (), 0.9)
     assert bool(found[len(surface) :].all())
     assert int(found[: len(surface)].sum()) <= 2
     if factor == 1:
-        clean = sn.remove_floaters(whole, cameras=cameras if with_views else ())
+        clean = sn.remove_floaters(whole, 0.9, cameras=cameras if with_views else ())
         assert clean.num_gaussians == int((~found).sum())
         truth = scene_of(surface, 0.02)
         assert sn.measure(clean, truth).psnr > 50
@@ -56,18 +58,18 @@ def test_what_no_view_sees_goes_and_no_image_changes():
     """A second wall right behind the first, and one behind the cameras; both touch themselves."""
     hidden = torch.cat([wall() * 0.5 + torch.tensor([0.0, 0.9, 0.0]), wall() + torch.tensor([0.0, -9.0, 0.0])])
     whole = scene_of(torch.cat([wall(), hidden]), 0.12)
-    found = floater_mask(whole, VIEWS)
+    found = floater_mask(whole, VIEWS, 0.5)
     assert float(found[:4000].float().mean()) < 0.05
     assert float(found[4000:8000].float().mean()) > 0.9
     assert bool(found[8000:].all())
     assert sn.measure(sn.remove_floaters(whole), whole).psnr > 70
-    assert int(floater_mask(whole, ())[4000:].sum()) <= 4, "without views, walls are supported"
+    assert int(floater_mask(whole, (), 0.5)[4000:].sum()) <= 4, "without views, walls are supported"
 
 
 def test_floaters_are_counted_after_values_without_meaning():
     whole = scene_of(torch.cat([wall(), planted()]), 0.02)
     whole.gaussians["means"][7] = math.nan
-    found = floater_mask(whole, VIEWS)
+    found = floater_mask(whole, VIEWS, 0.9)
     assert bool(found[7])
     assert int(found[:4000].sum()) <= 3
     assert bool(found[4000:].all())
@@ -82,8 +84,20 @@ def test_floaters_are_counted_after_values_without_meaning():
 @pytest.mark.parametrize("n", [1, 2, 5])
 def test_few_primitives(n):
     points = torch.arange(3.0 * n).view(n, 3)
-    assert int(floater_mask(scene_of(points, 9.0), ()).sum()) == 0
-    assert int(floater_mask(scene_of(points, 0.01), ()).sum()) == (n if n > 1 else 0)
+    assert int(floater_mask(scene_of(points, 9.0), (), 0.5).sum()) == 0
+    assert bool(floater_mask(scene_of(points, 0.01), (), 0.5).any()) == (n > 1)
+    with pytest.raises(ConfigError, match="strength of remove-floaters is 2"):
+        sn.remove_floaters(scene_of(points, 9.0), 2)
+
+
+def test_needles_and_balls_unlike_their_neighbours_go_and_a_background_stays():
+    whole = scene_of(wall(), 0.02)
+    whole.gaussians["features_dc"][:3] = 1.5  # white
+    whole.gaussians["scales"][0] = torch.tensor([1.0, 0.002, 0.002]).log()
+    whole.gaussians["scales"][1] = math.log(0.3)
+    whole.gaussians["scales"][2] = math.log(30.0)
+    assert floater_mask(whole, (), 0.9).nonzero()[:, 0].tolist() == [0, 1]
+    assert int(floater_mask(whole, (), 0.0).sum()) == 0
 
 
 def test_a_box_is_exact_and_keeps_all_else():

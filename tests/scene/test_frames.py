@@ -265,13 +265,6 @@ def test_a_view_of_many_more_pairs(build, perturb, camera):
     assert model._replay._can_record
 
 
-def test_empty_pixels_get_the_largest_depth():
-    depth = torch.tensor([[[2.0], [0.0]], [[5.0], [1.0]]])
-    alpha = torch.tensor([[[0.5], [0.0]], [[1.0], [0.1]]])
-    assert frames.fill_depth(depth, alpha)[..., 0].tolist() == [[2.0, 5.0], [5.0, 1.0]]
-    assert not frames.fill_depth(torch.zeros(2, 3, 1), torch.zeros(2, 3, 1)).any()
-
-
 def features(n=2000):
     generator = torch.Generator().manual_seed(0)
     spread = torch.tensor([0.1, 3.0, 0.01, 1.0, 0.3])
