@@ -275,7 +275,7 @@ def crop(scene: Scene, low: AnyArray, high: AnyArray) -> Scene:
 
 
 def remove_floaters(scene: Scene, strength: float = 0.5, *, cameras: Camera | Iterable[Camera] | None = None) -> Scene:
-    """The scene without what floats in the air or sticks out of it, and without what no camera sees.
+    """The scene without what floats or is not seen.
 
     Args:
         scene: to clean; it does not change.
