@@ -151,7 +151,7 @@ def test_commands_on_files_need_no_nerfstudio_and_a_prune_no_compiler(tmp_path):
     assert json.loads(done.stdout.splitlines()[-1]) == [0] * 7 + [2] * 2, done.stderr
     for command in commands[:7]:
         assert (tmp_path / command.split()[3]).stat().st_size > 0
-    pack, export = (line for line in done.stderr.splitlines() if line.startswith("sundae: "))
+    *_, pack, export = (line for line in done.stderr.splitlines() if line.startswith("sundae: "))
     assert "give the folder of a" in pack
     assert "gone does not exist; give a run" in export
 
