@@ -33,7 +33,7 @@ def made(path: Path, size: float, more: list[str], folder: Path) -> Path:
     packed = folder / "field.sundae"
     words = ["prune", str(path), "-o", str(packed)] if path.is_file() else ["train", str(path), "-o", str(folder)]
     words += ["--max-mb", f"{size:g}", *more, *([] if path.is_file() else ["--", "--timestamp", "run"])]
-    subprocess.run([Path(sys.executable).with_name("sundae"), *words], check=True, stdout=sys.stderr)
+    subprocess.run(["sundae", *words], check=True, stdout=sys.stderr)
     return packed if packed.exists() else next(folder.glob("*/*/run/scene.sundae"))
 
 
@@ -45,7 +45,7 @@ def figures(path: Path, size: float, more: list[str]) -> dict[str, Any]:
         if path.is_file():
             whole = sn.load(path, device=fastest_device())
             opened = against_first(path, whole, held_out_cameras(whole, ()))
-        full = measure(opened(packed), visible=False, repeats=0).full
+        full = measure(opened(packed), repeats=0).full
     means = {name: f"{full.mean(name):.{digits}f}" for name, digits in (("psnr", 3), ("ssim", 4))}
     return {"got_mb": f"{full.bytes / 1e6:.4f}", **means}
 

@@ -3,9 +3,9 @@
 # last.sh queue PART (carry .gpu/pPART), last.sh wait SECONDS
 set -u
 H=$PWD
-export PYTHONPATH=/opt/site PATH=/opt/site/bin:$PATH OMP_NUM_THREADS=4 NUMBA_NUM_THREADS=4 PYTHONUNBUFFERED=1 SLOTS=${SLOTS:-4} GPUS=4 RESERVED=
+export PYTHONPATH=/opt/site PATH=/opt/site/bin:$PATH OMP_NUM_THREADS=4 NUMBA_NUM_THREADS=4 PYTHONUNBUFFERED=1 SLOTS=${SLOTS:-4} GPUS=${GPUS:-4} RESERVED=
 R=/tmp/repo; J=/tmp/jobs; O=/tmp/out
-on() { printf '%s\n' "${@:2}" > $J/$1.sh.new; mv $J/$1.sh.new $J/$1.sh; }
+on() { printf '%s\n' "${@:2}" | if [ $GPUS = 1 ]; then sed '/^# gpu/d'; else cat; fi > $J/$1.sh.new; mv $J/$1.sh.new $J/$1.sh; }
 arm() { on $1-$3-$2 "# gpu $5" "cd /tmp; python3 $R/lab/few_arms.py /tmp/scenes/$2 /tmp/few $3 sundae 30000 --seed $4"; }
 if [ $1 = queue ]; then
   [ -f /tmp/logs/part$2 ] && exit 0
@@ -22,7 +22,8 @@ if [ $1 = queue ]; then
     [ -d $c ] || continue; n=$(basename $c); cp -r $c /tmp/scenes/
     case $n in
       courtyard)
-        for k in 42 43 44; do arm 10 $n default$k $k 2; done
+        for k in ${SEEDS:-42 43 44}; do arm 10 $n default$k $k 2; done
+        [ $GPUS = 1 ] && continue
         for m in 0.25 1 4; do on 11-size-$n-$m "# gpu $([ $m = 1 ] && echo 2 || echo 1)" "cd /tmp; python3 $R/benchmarks/sizes_asked.py /tmp/scenes/$n --sizes $m -o $O/sizes-$n-$m.csv"; done;;
       *) arm 10 $n default42 42 1;;
     esac

@@ -154,7 +154,7 @@ def _written(opened: Opened, path: Path, scene: PackedScene, codecs: Codecs) -> 
     report = write_fitted(path, scene, codecs)
     model = model_of(load(path)).to(opened.model.device).eval()
     subject = Subject.of_run(replace(opened, model=model, packed_bytes=report.bytes))
-    found = measure(subject, repeats=0, visible=False)
+    found = measure(subject, repeats=0)
     errors = {name: found.full.mean(name) for name in ("psnr", "ssim")}
     return {"bytes": report.bytes, **errors, **{f"{name}_base": found.base.mean(name) for name in ("psnr", "ssim")}}
 

@@ -84,7 +84,7 @@ def quality_page(results: Sequence[Result], arms: Sequence[Arm], command: str) -
         "",
         *_described(arms),
     ]
-    heads = ["arm", "rendered with", "keep", "seeds", "Gaussians", "PSNR, dB", "SSIM", "FLIP", "LPIPS", "JOD", "MB"]
+    heads = ["arm", "rendered with", "keep", "seeds", "Gaussians", "PSNR, dB", "SSIM", "fitted, dB", "LPIPS", "MB"]
     heads += ["ms a frame", "training, s"]
     for scene in dict.fromkeys(result["job"]["scene"] for result in results):
         rows = []

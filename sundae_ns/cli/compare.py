@@ -18,7 +18,7 @@ from sundae_ns.cli.options import Flag, Maybe, Overwrite, progress_bar
 from sundae_ns.cli.refusals import check_folder, check_least
 from sundae_ns.core.errors import ConfigError, SundaeError
 from sundae_ns.core.files import write_files
-from sundae_ns.core.metrics import Lpips, Net, flip_available, lpips_weights
+from sundae_ns.core.metrics import Lpips, Net, lpips_weights
 from sundae_ns.io.formats import FORMATS
 from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.scene.describe import HELD_OUT, held_out_cameras
@@ -81,9 +81,8 @@ def compare(
     lpips = Lpips(lpips_net) if photos and lpips_weights(lpips_net)[1].is_file() else None
     missing = f"LPIPS: the weights of its net ({lpips_net}) are missing; sundae doctor says where to put them."
     notes = [missing] if photos and lpips is None else []
-    notes += ["FLIP: the package is not installed; run pip install flip-evaluator."] * (photos and not flip_available())
     done, failures = list[ShownRun](), list[SundaeError]()
-    measured_by = partial(measure, lpips=lpips, visible=photos, warmup=warmup, repeats=repeats, command=command)
+    measured_by = partial(measure, lpips=lpips, warmup=warmup, repeats=repeats, command=command)
     with progress_bar() as progress, TemporaryDirectory() as folder:
         if formats:
             task, stem = progress.add_task("Writing all formats", total=None), scenes[0].stem

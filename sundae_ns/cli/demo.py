@@ -57,7 +57,7 @@ def demo(
             from sundae_ns.scene.page import write_page
 
             subject = Subject.of_run(load_model(run))
-            measured = measure(subject, label="demo", lpips=Lpips(), visible=False, warmup=1, repeats=3)
+            measured = measure(subject, label="demo", lpips=Lpips(), warmup=1, repeats=3)
             write_text(out / "eval.json", json.dumps(measured.as_json(), indent=2) + "\n")
             finished = load_run(run)
             packed = packed_bytes(finished)

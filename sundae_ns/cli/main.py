@@ -62,7 +62,7 @@ def _dispatch(words: Sequence[str]) -> int:
 
     if (flag := "--remove-floaters") in options:  # its number may be left out
         at = options.index(flag) + 1
-        options[at:at] = [] if "".join(options[at : at + 1]).replace(".", "", 1).isdigit() else ["0.5"]
+        options[at:at] = [] if "".join(options[at : at + 1]).replace(".", "", 1).isdigit() else ["0.25"]
     # Only the module of this command: some import torch, which takes a second.
     run = getattr(importlib.import_module(f"sundae_ns.cli.{name}"), name)
     short = importlib.import_module("sundae_ns.cli.options").SHORT

@@ -76,14 +76,16 @@ class Wishes:
     """keep the Gaussians whose centres are in this box: its lowest x y z, then its highest, in the coordinates of the
     file."""
     remove_floaters: Annotated[Maybe[float], tyro.conf.arg(metavar="[0 to 1]")] = None
-    """remove what floats, and what no camera of the photographs sees: from 0, what surely does, to 1; bare 0.5."""
+    """remove what floats, and what no camera of the photographs sees: from 0, what surely does, to 1; bare 0.25."""
 
     def check_wishes(self, **others: object) -> None:
         """Raise ``ConfigError`` for more than one amount, ``others`` included, or one that is out of range."""
         check_exclusive(keep=self.keep, count=self.count, max_mb=self.max_mb, **others)
         if self.keep is not None and not 0 < self.keep <= 1:
             raise ConfigError(f"keep is {self.keep}; give a share in (0, 1], or per cent as 25%")
-        check_least(count=(self.count, 1), max_mb=(self.max_mb, 0.001), remove_floaters=(self.remove_floaters, 0))
+        if not 0 <= (self.remove_floaters or 0) <= 1:
+            raise ConfigError(f"remove-floaters is {self.remove_floaters}; give 0 (careful) to 1 (thorough)")
+        check_least(count=(self.count, 1), max_mb=(self.max_mb, 0.001))
 
     @property
     def cleans(self) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import logging
 import urllib.request
 from collections.abc import Callable, Iterable
@@ -11,7 +10,6 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, Literal, TypeVar
 
-import numpy as np
 import torch
 from pytorch_msssim import ssim as windowed_ssim
 from torch import Tensor
@@ -65,24 +63,6 @@ def ssim(pred: Tensor, target: Tensor) -> Tensor:
     if min(pred.shape[:2]) < SSIM_WINDOW:
         return pred.new_full((), float("nan"))
     return windowed_ssim(pred.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None], data_range=1.0)
-
-
-def flip_available() -> bool:
-    """Whether the package that computes FLIP is installed."""
-    return importlib.util.find_spec("flip_evaluator") is not None
-
-
-@torch.no_grad()
-def flip(pred: Tensor, target: Tensor) -> Tensor | None:
-    """Mean FLIP error (Andersson et al. 2020), in [0, 1], at 67 pixels per degree; None without its package."""
-    check_pair(pred, target)
-    if not flip_available():
-        return None
-    from flip_evaluator import evaluate
-
-    reference, test = (np.ascontiguousarray(image.float().clamp(0, 1).cpu().numpy()) for image in (target, pred))
-    _, mean, _ = evaluate(reference, test, "LDR", applyMagma=False)
-    return torch.tensor(mean, dtype=torch.float32, device=pred.device)
 
 
 def lpips_weights(net: Net = "alex") -> tuple[str, Path]:
@@ -166,16 +146,12 @@ class ViewQuality:
 
     psnr: float  # dB
     ssim: float  # NaN for images smaller than its window
-    flip: float | None = None
     lpips: float | None = None
     psnr_fitted: float | None = None  # dB, by fitted_psnr
 
 
-def quality_of(
-    image: Tensor, truth: Tensor, lpips: Callable[[Tensor, Tensor], Any] | None = None, *, visible: bool = True
-) -> ViewQuality:
-    """Every metric of an image ``[H, W, 3]`` against its truth; FLIP, which takes a second, only if ``visible``."""
+def quality_of(image: Tensor, truth: Tensor, lpips: Callable[[Tensor, Tensor], Any] | None = None) -> ViewQuality:
+    """Every metric of an image ``[H, W, 3]`` against its truth."""
     metrics: dict[str, Any] = {"psnr": psnr, "psnr_fitted": fitted_psnr, "ssim": ssim, "lpips": lpips}
-    metrics |= {"flip": flip} if visible else {}
     values = {name: metric(image, truth) for name, metric in metrics.items() if metric is not None}
     return ViewQuality(**{name: float(value) for name, value in values.items() if value is not None})

@@ -361,7 +361,7 @@ class SundaeModel(SplatfactoModel):
         target = self.truth(batch, outputs)
         metrics = {"gaussian_count": float(self.source.total)}
         for suffix, image in (("", outputs["rgb"]), ("_base", outputs["base_rgb"])):
-            found = asdict(quality_of(image, target, self.lpips, visible=False))
+            found = asdict(quality_of(image, target, self.lpips))
             metrics |= {name + suffix: value for name, value in found.items() if value is not None}
         return metrics, {"img": torch.cat([target, outputs["rgb"]], dim=1), "base": outputs["base_rgb"]}
 

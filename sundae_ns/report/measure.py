@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 HEAD_ON, HEAD_OFF = "head on", "head off"
 # In the order of a table's columns, with their number of decimals.
-METRICS = (("psnr", 2), ("ssim", 4), ("psnr_fitted", 2), ("flip", 4), ("lpips", 4))
+METRICS = (("psnr", 2), ("ssim", 4), ("psnr_fitted", 2), ("lpips", 4))
 COLUMNS = (
     *("scene", "method", "variant", "keep_ratio", "seed", "steps", "primitives"),
     *("psnr", "ssim", "psnr_base", "ssim_base", "psnr_fitted", "lpips", "lpips_net"),
@@ -214,7 +214,7 @@ def cost_line(file: Path, source: Path, whole: Scene, name: str = "the whole sce
     """
     given, views = whole.cameras, held_out_cameras(whole, whole.cameras, seed=seed)
     opened = against_first(source, whole, views)
-    before, after = (measure(opened(path), visible=False, repeats=0) for path in (source, file))
+    before, after = (measure(opened(path), repeats=0) for path in (source, file))
     values = [min(view.psnr, MOST_PSNR) for view in after.full.views]
     by = f"{len(views)}{f' of {len(given)}' if len(given) > len(views) else ''} {'' if given else 'held-out '}cameras"
     if given and views[0][2:] != given[0][2:]:
@@ -236,7 +236,6 @@ def measure(
     *,
     label: str = "",
     lpips: Lpips | None = None,
-    visible: bool = True,
     warmup: int = 3,
     repeats: int = 5,
     progress: Callable[[], object] | None = None,
@@ -244,9 +243,8 @@ def measure(
 ) -> Measured:
     """Evaluate and time a scene in its views, with the head and without; ``label`` is its name in tables.
 
-    ``lpips`` and, if ``visible``, FLIP are left out where their weights or package are missing. ``warmup`` renders of
-    each view are untimed, ``repeats`` timed; none leaves times out. ``progress`` is called after each view, and the
-    ``command`` recorded.
+    ``lpips`` is left out where its weights are missing. ``warmup`` renders of each view are untimed, ``repeats`` timed;
+    none leaves times out. ``progress`` is called after each view, and the ``command`` recorded.
     """
     settings, gaussians = subject.settings, subject.source.gaussians
     device, head = gaussians["means"].device, settings.head
@@ -256,7 +254,7 @@ def measure(
     views: dict[str, list[ViewQuality]] = {name: [] for name in ways}
     for i, truth in enumerate(subject.truths):
         for name, on in ways.items():
-            views[name].append(quality_of(subject.image(i, head=on), truth, lpips, visible=visible))
+            views[name].append(quality_of(subject.image(i, head=on), truth, lpips))
             if repeats:
                 times[name].append(time(partial(subject.image, i, head=on)))
         if repeats:
@@ -293,7 +291,7 @@ def cells_of(runs: Sequence[Measured]) -> tuple[list[str], list[list[str]]]:
     """Heads, and the cells of each configuration of some scenes; columns in which nothing is measured are left out."""
     nets = sorted({run.lpips_net for run in runs if run.full.mean("lpips") is not None})
     heads = ["scene", "rendered with", "Gaussians", "MB", "ms per frame", "PSNR, dB", "worst, dB", "SSIM"]
-    heads += ["fitted, dB", "FLIP", f"LPIPS ({', '.join(nets)})"]
+    heads += ["fitted, dB", f"LPIPS ({', '.join(nets)})"]
     no_head = "no head" if any(run.has_head for run in runs) else "-"
     rows = []
     for run in runs:

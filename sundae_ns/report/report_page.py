@@ -33,7 +33,7 @@ ERROR_COLORS: NDArray[np.uint8] = np.round(
     255 * matplotlib.colormaps["magma"](np.linspace(0, 1, 32))[:, :3]  # readable in grey and with colour deficiency
 ).astype(np.uint8)
 """Colours of an error map ``[32, 3]``, from no error to the largest; few, because they decide its bytes."""
-NAMES = {"psnr": "PSNR", "psnr_fitted": "colours fitted", "ssim": "SSIM", "flip": "FLIP", "lpips": "LPIPS"}
+NAMES = {"psnr": "PSNR", "psnr_fitted": "colours fitted", "ssim": "SSIM", "lpips": "LPIPS"}
 
 
 @dataclass(frozen=True)

@@ -274,7 +274,7 @@ def crop(scene: Scene, low: AnyArray, high: AnyArray) -> Scene:
     return scene[crop_mask(scene, low, high)]
 
 
-def remove_floaters(scene: Scene, strength: float = 0.5, *, cameras: Camera | Iterable[Camera] | None = None) -> Scene:
+def remove_floaters(scene: Scene, strength: float = 0.25, *, cameras: Camera | Iterable[Camera] | None = None) -> Scene:
     """The scene without what floats or is not seen.
 
     Args:

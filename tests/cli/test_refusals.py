@@ -62,6 +62,7 @@ REFUSALS = {
     "pack in.ply -o a.sundae --start-view 0": "there is no camera 0 in the scene; give a camera file",
     "pack in.ply -o a.sundae --target-drop 1": "leave out --target-drop, or give a run",
     "pack in.ply -o a.sundae --target-drop 1 --remove-floaters": "leave out --remove-floaters",
+    "prune gone -o a.ply --remove-floaters 1.5": "remove-floaters is 1.5; give 0 (careful) to 1",
     "pack in.ply -o a.sundae --finetune 5 --crop 0 0 0 1 1 1": "leave out --crop",
     "pack gone -o a.sundae": "gone cannot be read",
     "pack gone -o in.bin/a.sundae": "in.bin is no folder; choose another",

@@ -7,7 +7,7 @@ import torch
 from skimage.metrics import structural_similarity
 
 from sundae_ns.core.errors import DataError
-from sundae_ns.core.metrics import MOST_PSNR, Lpips, fitted_psnr, flip, lpips_weights, psnr, quality_of, ssim
+from sundae_ns.core.metrics import MOST_PSNR, Lpips, fitted_psnr, lpips_weights, psnr, quality_of, ssim
 
 
 def _pair(height=40, width=30, noise=0.1):
@@ -54,28 +54,13 @@ def test_smallest_image_with_an_ssim():
         assert psnr(*_pair(*size)).isfinite()
 
 
-@pytest.mark.parametrize("metric", [psnr, ssim, flip])
+@pytest.mark.parametrize("metric", [psnr, ssim])
 @pytest.mark.parametrize("shape", [(4, 5), (3, 4, 5), (1, 4, 5, 3)])
 def test_wrong_shapes(metric, shape):
     with pytest.raises(DataError, match="shapes"):
         metric(torch.zeros(shape), torch.zeros(shape))
     with pytest.raises(DataError, match="shapes"):
         metric(torch.zeros(20, 20, 3), torch.zeros(20, 21, 3))
-
-
-def test_flip_is_the_authors_metric():
-    evaluate = pytest.importorskip("flip_evaluator").evaluate
-    truth, image = torch.rand(20, 30, 3), torch.rand(20, 30, 3)
-    expected = evaluate(truth.numpy(), image.numpy(), "LDR", applyMagma=False)[0].mean()
-    assert float(flip(image, truth)) == pytest.approx(float(expected), rel=1e-4)
-    assert flip(truth, truth) == 0
-    # Values are clamped to [0, 1] first.
-    assert float(flip(image + 2, truth)) == pytest.approx(float(flip(torch.ones_like(truth), truth)), abs=1e-6)
-
-
-def test_without_its_package_there_is_no_flip(monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    assert flip(torch.zeros(4, 4, 3), torch.zeros(4, 4, 3)) is None
 
 
 @pytest.fixture
@@ -127,8 +112,8 @@ def test_weights_on_disk_are_used_without_the_network(hub):
 
 def test_quality_has_what_can_be_measured():
     image, truth = _pair()
-    found = quality_of(image.float(), truth.float(), lambda *_: None, visible=False)
-    assert (found.flip, found.lpips) == (None, None)
+    found = quality_of(image.float(), truth.float(), lambda *_: None)
+    assert found.lpips is None
     assert found.psnr == pytest.approx(float(psnr(image, truth)), abs=1e-4)
     assert found.psnr_fitted >= found.psnr
     assert quality_of(image, truth, lambda *_: torch.tensor(0.5)).lpips == 0.5

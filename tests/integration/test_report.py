@@ -21,7 +21,6 @@ from PIL import Image
 
 import sundae_ns as sn
 from sundae_ns.core.errors import DataError
-from sundae_ns.core.metrics import flip_available
 from sundae_ns.io import checkpoint
 from sundae_ns.io.pack.packed_scene import write_scene
 from sundae_ns.plugin import finished_runs
@@ -137,7 +136,6 @@ def test_rows_are_of_the_runs(report, tiny, opened):
     own, stock = (row["configurations"] for row in json.loads((report / "report.json").read_text()))
     assert [[way["name"] for way in ways] for ways in (own, stock)] == [["head on", "head off"], ["head off"]]
     assert own[1]["bytes"] == sum(4 * value.numel() for name, value in gaussians.items() if name != "features")
-    assert all((view["flip"] is not None) == flip_available() for way in own for view in way["views"])
 
 
 def test_the_page_shows_the_views_with_their_figures(report, tiny):
