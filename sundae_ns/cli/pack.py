@@ -88,9 +88,8 @@ def pack(
     before = Left(scene, None, len(scene), cameras=chosen_cameras(scene, advanced.cameras, None))
     # A fine-tune shrinks the file, and the search below rounds it to its size.
     max_mb = None if wishes.max_mb is None else wishes.max_mb / (FINETUNED_SIZE if tuned else 1)
-    roomy, like = replace(wishes, max_mb=max_mb), out.with_suffix(".sundae")
-    with redirect_stdout(sys.stderr):  # warnings, beside --json
-        left = reduced(before, run, roomy, advanced, out=like, rounds=not tuned)
+    like = out.with_suffix(".sundae")
+    left = reduced(before, run, replace(wishes, max_mb=max_mb), advanced, out=like, rounds=not tuned)
     most = None if wishes.max_mb is None else int(wishes.max_mb * MEGABYTE)
     source = contents_of(left.stated)
     with progress_bar() as bar, redirect_stdout(StringIO()):  # nerfstudio's messages
