@@ -3,10 +3,10 @@
     python benchmarks/bench_graph.py --points 5000000 --device cuda
     python benchmarks/bench_graph.py --points 1000000 --distributions field uniform --sample 1000
 
-Seconds are medians; the clock waits for the device. ``index_mismatches`` counts rows of neighbours that differ from
-those of scipy's k-d tree beyond ties, in a sample of the points. ``response_rel_error`` is relative to the same in
-float64; ``isolation_mismatches`` counts points that are isolated in one precision only. ``peak_mib`` is the memory of a
-build on CUDA beyond that of the points. Lines belong in results/graph.jsonl.
+Seconds are medians, ``seconds`` is their sum; the clock waits for the device. ``index_mismatches`` counts rows of
+neighbours that differ from those of scipy's k-d tree beyond ties, in a sample of the points. ``response_rel_error`` is
+relative to the same in float64; ``isolation_mismatches`` counts points that are isolated in one precision only.
+``peak_mib`` is the memory of a build on CUDA beyond that of the points. Lines belong in results/graph.jsonl.
 
 - field: like a trained field. A thousand discs of equal counts, 0.001 to 3 units wide and a fiftieth as thick; one
   point in 50 floats up to 100 units away, one in 100 is a clone of another.
@@ -18,8 +18,8 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import statistics
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from sundae_ns.core.timing import now
+from sundae_ns.core.timing import median_ms
 from sundae_ns.graph.filters import high_pass
-from sundae_ns.graph.graph import NeighborGraph, build_graph
+from sundae_ns.graph.graph import build_graph
 
 NEIGHBORS = 16
 TIE = 1e-12
@@ -63,35 +63,23 @@ def measure(points: Tensor, device: str, repeats: int, sample: int) -> dict[str,
 
     ``repeats`` runs are timed after an untimed one; ``sample`` rows are compared with scipy.
     """
-    placed = points.to(device)
-    times: list[tuple[float, float]] = []
-
-    def run() -> tuple[NeighborGraph, Tensor]:
-        started = now(device)
-        graph = build_graph(placed, num_neighbors=NEIGHBORS)
-        built = now(device)
-        response = high_pass(graph, placed)
-        times.append((built - started, now(device) - built))
-        return graph, response
-
-    run()
-    times.clear()
-    for _ in range(repeats):
-        run()
-    before = 0
+    placed, before = points.to(device), 0
+    build = partial(build_graph, placed, num_neighbors=NEIGHBORS)
+    builds = median_ms(build, device=device, warmup=1, repeats=repeats) / 1000
     if device == "cuda":
         before = torch.cuda.memory_allocated()
         torch.cuda.reset_peak_memory_stats()
-    graph, response = run()
+    graph = build()
+    response = high_pass(graph, placed)
     peak = round((torch.cuda.max_memory_allocated() - before) / 2**20, 1) if device == "cuda" else None
-    builds, responses = zip(*times[:repeats], strict=True)
+    responses = median_ms(partial(high_pass, graph, placed), device=device, warmup=1, repeats=repeats) / 1000
     error, isolated = response_error(placed, response)
     rows = np.linspace(0, len(points) - 1, min(sample, len(points))).astype(int)
     wrong = wrong_rows(points.double().numpy(), graph.indices.cpu().numpy(), rows)
     return {
-        "seconds": rounded(statistics.median(map(sum, times[:repeats]))),
-        "graph_seconds": rounded(statistics.median(builds)),
-        "response_seconds": rounded(statistics.median(responses)),
+        "seconds": rounded(builds + responses),
+        "graph_seconds": rounded(builds),
+        "response_seconds": rounded(responses),
         "index_mismatches": wrong,
         "response_rel_error": rounded(error, 3),
         "isolation_mismatches": isolated,

@@ -14,7 +14,6 @@ import argparse
 import json
 import subprocess
 import sys
-import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
@@ -25,11 +24,11 @@ from typing import Any
 import torch
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-from nerfstudio.scripts.train import _set_random_seed
 
-from harness.job import configure, without_lpips
+from harness.job import configure, trainer_of
 from harness.plan import Job, parser_of
 from sundae_ns.core.metrics import psnr, ssim
+from sundae_ns.core.timing import now
 
 ARMS: dict[str, list[str]] = {
     "splatfacto": ["splatfacto"],
@@ -45,7 +44,7 @@ def steps_of(options: argparse.Namespace, arm: str) -> int:
     return int(options.steps or config.max_num_iterations)
 
 
-def trainer_of(options: argparse.Namespace, arm: str, out: str) -> Any:
+def trainer_of_arm(options: argparse.Namespace, arm: str, out: str) -> Any:
     """A trainer that is set up."""
     method, *words = ARMS[arm]
     words += ["--viewer.quit-on-train-completion", "True", "--pipeline.datamanager.cache-images", "gpu"]
@@ -54,13 +53,7 @@ def trainer_of(options: argparse.Namespace, arm: str, out: str) -> Any:
     parser, capture = parser_of(options.capture), options.capture
     job = Job(arm, "whole", capture.name, arm, str(capture), method, steps_of(options, arm), options.seed)
     job = replace(job, options=(*words, *options.option), parser=parser)
-    config, _ = configure(job, Path(out))
-    _set_random_seed(options.seed)
-    with without_lpips():
-        trainer: Any = config.setup(local_rank=0, world_size=1)
-        trainer.setup()
-    trainer.save_checkpoint = lambda step: None
-    return trainer
+    return trainer_of(configure(job, Path(out))[0])[0]
 
 
 def quality(trainer: Any) -> tuple[float, float]:
@@ -79,7 +72,7 @@ def quality(trainer: Any) -> tuple[float, float]:
 def timed(options: argparse.Namespace, arm: str, out: str) -> dict[str, Any]:
     """Train with the clock running; the figures of the row."""
     sys.stdout = sys.stderr  # for what nerfstudio prints in this process
-    trainer = trainer_of(options, arm, out)
+    trainer = trainer_of_arm(options, arm, out)
     curve: list[list[float]] = []
     spent = 0.0
 
@@ -87,18 +80,15 @@ def timed(options: argparse.Namespace, arm: str, out: str) -> dict[str, Any]:
         nonlocal spent
         if step + 1 not in options.curve:
             return
-        torch.cuda.synchronize()
-        stopped = time.perf_counter()
+        stopped = now("cuda")
         curve.append([round(stopped - started - spent, 2), *(round(value, 4) for value in quality(trainer))])
-        spent += time.perf_counter() - stopped
+        spent += now("cuda") - stopped
 
     trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], look))
     torch.cuda.reset_peak_memory_stats()
-    torch.cuda.synchronize()
-    started = time.perf_counter()
+    started = now("cuda")
     trainer.train()
-    torch.cuda.synchronize()
-    seconds = time.perf_counter() - started - spent
+    seconds = now("cuda") - started - spent
     peak = torch.cuda.max_memory_allocated() / 2**20
     decibels, similarity = quality(trainer)
     return {
@@ -112,12 +102,6 @@ def timed(options: argparse.Namespace, arm: str, out: str) -> dict[str, Any]:
     }
 
 
-def commit() -> str | None:
-    """The checked-out commit; None outside of a repository."""
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
-    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip() or None
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("capture", type=Path, help="folder with images and sparse/0")
@@ -128,11 +112,13 @@ def main() -> None:
     parser.add_argument("--option", action="append", default=[], help="a further word of ns-train")
     parser.add_argument("-o", "--output", type=Path, help="file to append the lines to")
     options = parser.parse_args()
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    commit = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
     for arm in options.arms:
         with TemporaryDirectory() as out, ProcessPoolExecutor(1, get_context("spawn")) as alone:
             measured = alone.submit(timed, options, arm, out).result()
         row = {"arm": arm, "scene": options.capture.name, "steps": steps_of(options, arm), "seed": options.seed}
-        row |= {**measured, "gpu": torch.cuda.get_device_name(0), "commit": commit()}
+        row |= {**measured, "gpu": torch.cuda.get_device_name(0), "commit": commit or None}
         print(json.dumps(row), flush=True)
         if options.output is not None:
             with options.output.open("a") as file:

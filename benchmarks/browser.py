@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
-import os
 import random
 import re
 import sys
@@ -22,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import torch
 
 from harness.chromium import find_chromium, wait_for
@@ -33,11 +33,6 @@ STEP = re.compile(r"(\d+) \(\d+\.\d+%\)")
 """nerfstudio's table of progress."""
 SLICE = 30.0
 """In every period of this many seconds images must arrive."""
-
-
-def resident(pid: int) -> float:
-    """Megabytes of a process in the host's memory."""
-    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def last_step(log: str) -> int:
@@ -62,6 +57,7 @@ def main() -> None:
         words += ["--max-num-iterations", 10_000_000, "--steps-per-save", 10_000_000, "--logging.steps-per-log", 10]
         words += ["--pipeline.model.pruning.prune-at", PRUNE_AT, "--pipeline.model.warmup-length", 5]
         server = Server(words, Path(folder) / "train.log", "(0.00%)")
+        training = psutil.Process(server.process.pid)
         try:
             with ViewerPage(chromium, 640, 400) as page:
                 wait_for(server.listens, "ns-train", 180)
@@ -86,7 +82,7 @@ def main() -> None:
                         act(*words)
                         acted, next_act = acted + 1, now + 5
                     page.drag(200, 250, 200 + chance.uniform(-80, 80), 250 + chance.uniform(-30, 30), seconds=0.5)
-                    samples.append((now - start, resident(server.process.pid), last_step(server.output())))
+                    samples.append((now - start, training.memory_info().rss / 1e6, last_step(server.output())))
                     if now - start > SLICE * len(arrived):
                         arrived.append(len(page.images))
                 arrived.append(len(page.images))

@@ -119,7 +119,7 @@ def quality(run: Path) -> float:
     return sn.measure(sn.load(run, device=opened.model.device), opened.truths, cameras).psnr
 
 
-def kill_trainings(kind: str, options: argparse.Namespace, bench: Bench, root: Path, kills: int) -> dict[str, Any]:
+def kill_trainings(kind: str, options: argparse.Namespace, bench: Bench, root: Path, kills: range) -> dict[str, Any]:
     """Kill trainings of one kind; counts of the outcomes, with ``lost`` for those that differ."""
     (steps, save_every, inner, _), rng = TRAININGS[kind], random.Random(options.seed)
     parsed, exact = config_of(kind, options, root), options.device == "cpu"
@@ -140,9 +140,7 @@ def kill_trainings(kind: str, options: argparse.Namespace, bench: Bench, root: P
     lost = 0
     # One kill at each place, then random ones; half of the rest at any time. Ranks have modules of their own.
     every = [ANY, *(inner if options.gpus == 1 else ())]
-    # A seed starts where those before it end, so that short calls reach every place.
-    numbers = range(options.seed * kills, (options.seed + 1) * kills)
-    places = [every[i] if i < len(every) else ANY if i % 2 else rng.choice(every) for i in numbers]
+    places = [every[i] if i < len(every) else ANY if i % 2 else rng.choice(every) for i in kills]
     for number, place in enumerate(track(places, description=f"Killing: {kind}", transient=True)):
         config, nth = configured(f"killed-{number}"), rng.randint(1, 5)
         folder = run_folder(config)
@@ -152,8 +150,6 @@ def kill_trainings(kind: str, options: argparse.Namespace, bench: Bench, root: P
             killed = bench.killed_at_any_time(start, again, seconds, rng)
         else:
             killed = bench.ended(bench.start(train_here, config, place, nth)) == -signal.SIGKILL
-        tally["killed"] += killed
-        tally[f"at {place}"] += killed
         try:
             done = int(checkpoint.newest_whole(models)[0].stem.partition("-")[2]) + 1
             tally["resumed" if done < steps else "killed after the last save"] += 1
@@ -169,9 +165,10 @@ def kill_trainings(kind: str, options: argparse.Namespace, bench: Bench, root: P
         if not exact:
             resumed_psnr.append(quality(folder))
         equal = same(result, reference) if exact else resumed_psnr[-1] > min(psnr) - SPREAD
-        for name, held in (("one prune", one_prune), ("the same result", equal), ("nothing left lying", clean)):
-            tally[name] += held
-        lost += not (killed and one_prune and equal and clean)
+        held = {"one prune": one_prune, "the same result": equal, "nothing left lying": clean}
+        for fact, true in {"killed": killed, f"at {place}": killed, **held}.items():
+            tally[fact] += true
+        lost += not (killed and all(held.values()))
         shutil.rmtree(config.output_dir)
     about: dict[str, Any] = {"steps": steps, "save_every": save_every}
     about |= {"same seed, same result": repeatable} if exact else {"psnr": [psnr, resumed_psnr]}
@@ -188,7 +185,7 @@ def write_all(folder: Path, files: Mapping[str, bytes]) -> None:
         (folder / path).write_bytes(content)
 
 
-def kill_commands(kind: str, options: argparse.Namespace, bench: Bench, root: Path, kills: int) -> dict[str, Any]:
+def kill_commands(kind: str, options: argparse.Namespace, bench: Bench, root: Path, kills: range) -> dict[str, Any]:
     """Kill commands that write over older results; as :func:`kill_trainings`."""
     rng, folder = random.Random(options.seed), root / kind
     config = config_of("training", options, folder)
@@ -211,8 +208,7 @@ def kill_commands(kind: str, options: argparse.Namespace, bench: Bench, root: Pa
     tally: Counter[str] = Counter()
     lost = 0
     every = [ANY, *killing.COMMANDS]
-    numbers = range(options.seed * kills, (options.seed + 1) * kills)
-    for number in track(numbers, description="Killing: commands", transient=True):
+    for number in track(kills, description="Killing: commands", transient=True):
         name, place = list(COMMANDS)[number % len(COMMANDS)], every[(number // len(COMMANDS)) % len(every)]
         output, older = outputs[name], dict.fromkeys(fresh[name], b"older")
         age: partial[None] = partial(write_all, output, older)
@@ -226,11 +222,10 @@ def kill_commands(kind: str, options: argparse.Namespace, bench: Bench, root: Pa
         kept = all(left.get(path) in (older[path], fresh[name][path]) for path in older)
         bench.finish(command_here, words(name))
         again = contents(output) == fresh[name]
-        tally["killed"] += killed
-        tally[f"at {place}"] += killed
-        tally["older or new, and whole"] += kept
-        tally["then the same command succeeds, and nothing is left lying"] += again
-        lost += not (killed and kept and again)
+        held = {"older or new, and whole": kept, "then the same command succeeds, and nothing is left lying": again}
+        for fact, true in {"killed": killed, f"at {place}": killed, **held}.items():
+            tally[fact] += true
+        lost += not (killed and all(held.values()))
     return {"commands": {name: words[0] for name, words in COMMANDS.items()}, **tally, "lost": lost}
 
 
@@ -251,7 +246,9 @@ def main() -> None:
     lost = 0
     for kind in options.kinds:
         kills = options.kills or KILLS[kind]
-        result = (kill_commands if kind == "commands" else kill_trainings)(kind, options, bench, root, kills)
+        # A seed starts where those before it end, so that short calls reach every place.
+        numbers = range(options.seed * kills, (options.seed + 1) * kills)
+        result = (kill_commands if kind == "commands" else kill_trainings)(kind, options, bench, root, numbers)
         lost += result["lost"]
         device = torch.cuda.get_device_name(0) if options.device == "cuda" else "cpu"
         print(json.dumps({"kind": kind, "device": device, "ranks": options.gpus, "kills": kills, **result}), flush=True)

@@ -16,15 +16,15 @@ import csv
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 import torch.distributed as dist
-from nerfstudio.scripts.train import _set_random_seed
 
-from harness.job import parse
-from harness.plan import parser_of
+from harness.job import configure, trainer_of
+from harness.plan import Job, parser_of
 from sundae_ns.io import checkpoint
 from sundae_ns.io.formats import read_gaussians
 
@@ -82,12 +82,10 @@ class Clock:
 
 
 def config_of(options: argparse.Namespace, extra: list[str], folder: Path, *, tiled: bool) -> Any:
-    data = options.data.resolve()
-    words = [options.method, "--data", str(data), "--output-dir", str(folder), "--vis", "tensorboard"]
-    words += ["--max-num-iterations", str(options.tiled_steps if tiled else options.steps), *extra, *parser_of(data)]
-    config: Any = parse(words)
-    config.experiment_name, config.timestamp = "tiled" if tiled else "whole", "now"
-    config.steps_per_eval_image = config.steps_per_eval_all_images = config.steps_per_save = 10**9
+    data, name = options.data.resolve(), "tiled" if tiled else "whole"
+    steps = options.tiled_steps if tiled else options.steps
+    job = Job(name, "whole", data.name, name, str(data), options.method, steps, seed=42)
+    config: Any = configure(replace(job, options=tuple(extra), parser=parser_of(data)), folder)[0]
     model = config.pipeline.model
     model.evaluate_prune = False
     if model.pruning.decides:
@@ -108,10 +106,7 @@ def measure(rank: int, ranks: int, folder: Path, options: argparse.Namespace, ex
         dist.init_process_group("nccl" if cuda else "gloo", init_method=meeting, rank=rank, world_size=ranks)
     config = config_of(options, extra, folder, tiled=tiled)
     config.machine.device_type, config.machine.num_devices = ("cuda" if cuda else "cpu"), ranks
-    _set_random_seed(config.machine.seed + rank)
-    trainer: Any = config.setup(local_rank=rank, world_size=ranks)
-    trainer.setup()
-    trainer.save_checkpoint = lambda step: None
+    trainer, _ = trainer_of(config, rank, ranks)
     save = warm if ranks == 1 and not tiled and not warm.exists() else None
     clock = Clock(trainer, ranks, WARM if tiled and cuda else 0, save)
     if cuda:

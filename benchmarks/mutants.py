@@ -23,11 +23,11 @@ import importlib.util
 import json
 import os
 import random
-import signal
 import sys
 import time
 from collections.abc import Iterator
 from copy import copy, deepcopy
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -142,24 +142,22 @@ def tests_of(name: str, path: Path) -> list[str]:
 
 def noticed(tests: list[str], finder: Changed | None) -> bool:
     """Whether the tests fail, with a changed module if one is given."""
-    child = os.fork()
-    if child == 0:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        os.dup2(1, 2)
-        if finder is not None:
-            sys.meta_path.insert(0, finder)
-        os.chdir(ROOT)
-        os._exit(int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", *tests]) != 0))
     # No alarm in the child: tests of bad input set one themselves.
-    began = time.monotonic()
-    while time.monotonic() - began < SECONDS:
-        ended, status = os.waitpid(child, os.WNOHANG)
-        if ended:
-            return status != 0
-        time.sleep(0.01)
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    return True
+    child = get_context("fork").Process(target=run_tests, args=(tests, finder))
+    child.start()
+    child.join(SECONDS)
+    child.kill()  # does nothing to one that has ended
+    child.join()
+    return child.exitcode != 0
+
+
+def run_tests(tests: list[str], finder: Changed | None) -> None:
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    os.dup2(1, 2)
+    if finder is not None:
+        sys.meta_path.insert(0, finder)
+    os.chdir(ROOT)
+    os._exit(int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", *tests]) != 0))
 
 
 def main() -> None:

@@ -7,7 +7,7 @@ python benchmarks/plot.py curve      # one of them
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -35,12 +35,6 @@ KEPT_RULES = {
 """Rules of the plot, by the names that readers see."""
 
 
-def fixed_shares(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Rows of a capture at fixed shares, the smallest first."""
-    found = (row for row in rows if row["chosen"] == "no" and row["method"] == "sundae")
-    return sorted(found, key=lambda row: float(row["share"]))
-
-
 def logarithmic(panel: Any, ticks: list[float]) -> None:
     panel.set_xscale("log")
     panel.xaxis.set_major_formatter("{x:g}")
@@ -59,7 +53,8 @@ def plot_curve() -> Any:
     figure, panels = plt.subplots(2, len(captures), figsize=size, layout="constrained", sharex="col")
     for column, capture in zip(panels.T, captures, strict=True):
         own = [row for row in rows if row["capture"] == capture]
-        fixed = fixed_shares(own)
+        fixed = [row for row in own if row["chosen"] == "no" and row["method"] == "sundae"]
+        fixed.sort(key=lambda row: float(row["share"]))
         for panel, metric in zip(column, ("psnr", "ssim"), strict=True):
             sizes = [int(row["packed_bytes"]) / MB for row in fixed]
             values = [float(row[f"packed_{metric}"]) for row in fixed]
@@ -135,14 +130,11 @@ PLOTS: dict[str, Callable[[], Any]] = {"curve": plot_curve, "rules": plot_rules,
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("plots", nargs="*", default=list(PLOTS), help=f"{', '.join(PLOTS)}; by default all")
+    parser.add_argument("plot", nargs="?", choices=PLOTS, help="by default all")
     parser.add_argument("-o", "--out", type=Path, default=FIGURES, help="folder")
     options = parser.parse_args()
-    odd = [name for name in options.plots if name not in PLOTS]
-    if odd:
-        parser.error(f"no plot {odd[0]}; give some of {', '.join(PLOTS)}")
     options.out.mkdir(parents=True, exist_ok=True)
-    for name in options.plots:
+    for name in [options.plot] if options.plot else PLOTS:
         figure = PLOTS[name]()
         if figure is not None:
             figure.savefig(options.out / f"{name}.png", dpi=110)

@@ -11,9 +11,7 @@ import json
 import os
 import shutil
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
 from copy import deepcopy
 from dataclasses import asdict, replace
 from functools import cache
@@ -25,7 +23,7 @@ import torch
 import tyro
 from filelock import FileLock
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods
-from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import profiler, writer
 
@@ -34,6 +32,7 @@ from harness.run import run_script
 from sundae_ns.core.errors import BackendError, CheckpointError, PackError, SundaeError
 from sundae_ns.core.files import write_text
 from sundae_ns.core.metrics import Lpips, lpips_weights
+from sundae_ns.core.timing import now
 from sundae_ns.io.pack.codecs import Codecs
 from sundae_ns.io.pack.config import FINETUNE_STEPS, FINETUNED, PackConfig
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, write_fitted
@@ -48,16 +47,6 @@ from sundae_ns.train.schedules import set_schedule
 
 NEVER = 10**9
 """A step that no training reaches."""
-
-
-def read_result(path: Path) -> dict[str, Any] | None:
-    """Result of a finished job; None if it is not finished. ``CheckpointError`` if the file is damaged."""
-    try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError, TypeError) as error:
-        raise CheckpointError(f"{path} cannot be read ({error}); remove it, and the job is done again") from error
 
 
 def perform(job: Job, out: Path) -> None:
@@ -165,22 +154,15 @@ def _measured(job: Job, config: TrainerConfig, command: str) -> tuple[Opened, Me
     # Records of an attempt that was stopped would be taken for this one's.
     shutil.rmtree(config.get_base_dir(), ignore_errors=True)
     config.save_config()
-    _set_random_seed(config.machine.seed)
-    with without_lpips():
-        trainer: Trainer = config.setup(local_rank=0, world_size=1)
-        trainer.setup()
-        save = trainer.save_checkpoint
-        trainer.save_checkpoint = lambda step: None  # type: ignore[method-assign]
-        if cuda:
-            torch.cuda.reset_peak_memory_stats()
-            torch.cuda.synchronize()
-        started = time.perf_counter()
-        trainer.train()
-        if cuda:
-            torch.cuda.synchronize()
-        seconds = time.perf_counter() - started
-        peak = torch.cuda.max_memory_allocated() / 2**20 if cuda else None
-        save(trainer.step)
+    trainer, save = trainer_of(config)
+    device = "cuda" if cuda else "cpu"
+    if cuda:
+        torch.cuda.reset_peak_memory_stats()
+    started = now(device)
+    trainer.train()
+    seconds = now(device) - started
+    peak = torch.cuda.max_memory_allocated() / 2**20 if cuda else None
+    save(trainer.step)
     folder = trainer.base_dir
     del trainer, save
     _forget()
@@ -191,12 +173,25 @@ def _measured(job: Job, config: TrainerConfig, command: str) -> tuple[Opened, Me
     return opened, measured if job.keep_ratio is None else replace(measured, keep_ratio=job.keep_ratio)
 
 
+def trainer_of(config: TrainerConfig, rank: int = 0, ranks: int = 1) -> tuple[Any, Callable[[int], None]]:
+    """A trainer that is set up and saves nothing, and the function by which it would save."""
+    _set_random_seed(config.machine.seed + rank)
+    # Stock splatfacto builds LPIPS, whose weights it would download; training evaluates nothing.
+    name = "torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity"
+    with mock.patch(name, return_value=torch.nn.Module()):
+        trainer: Any = config.setup(local_rank=rank, world_size=ranks)
+        trainer.setup()
+    save, trainer.save_checkpoint = trainer.save_checkpoint, lambda step: None
+    return trainer, save
+
+
 def configure(job: Job, out: Path) -> tuple[TrainerConfig, str]:
     """The configuration as ``ns-train`` parses it, and that command; ``CheckpointError`` if its warm-up is not done."""
     start: Words = ()
     if job.kind == "branch":
-        start = ("--pipeline.model.warm-start", str(_run_folder(out, job.needs) / "nerfstudio_models"))
-    arguments = _arguments(job, start)
+        start = ("--pipeline.model.warm-start", str(_run_folder(out, str(job.needs)) / "nerfstudio_models"))
+    fixed = ("--data", job.data, "--machine.seed", str(job.seed), "--max-num-iterations", str(job.steps))
+    arguments = (job.method, *fixed, *job.options, *start, *job.parser)
     config = parse(arguments)
     config.output_dir = job_folder(out, job.key)
     config.experiment_name, config.timestamp = job.arm, "run"
@@ -221,24 +216,16 @@ def _parsed(arguments: Words) -> TrainerConfig:
     return config
 
 
-def _arguments(job: Job, start: Words) -> Words:
-    """Words after ``ns-train``, with those of the place that the job starts from."""
-    fixed = ("--data", job.data, "--machine.seed", str(job.seed), "--max-num-iterations", str(job.steps))
-    return (job.method, *fixed, *job.options, *start, *job.parser)
-
-
-def _run_folder(out: Path, key: str | None) -> Path:
-    result = read_result(done_file(out, str(key)))
-    if result is None:
-        raise CheckpointError(f"the warm-up {key} is not done; run the whole plan")
-    # The folder in the result may be an old one: comparisons move.
-    return job_folder(out, str(key)) / result["job"]["arm"] / result["job"]["method"] / "run"
-
-
-def without_lpips() -> AbstractContextManager[Any]:
-    """Keep stock splatfacto from building LPIPS, whose weights it would download; training evaluates nothing."""
-    name = "torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity"
-    return mock.patch(name, return_value=torch.nn.Module())
+def _run_folder(out: Path, key: str) -> Path:
+    path = done_file(out, key)
+    try:
+        done = json.loads(path.read_text(encoding="utf-8"))["job"]
+        # The folder in the result may be an old one: comparisons move.
+        return job_folder(out, key) / done["arm"] / done["method"] / "run"
+    except FileNotFoundError as error:
+        raise CheckpointError(f"the warm-up {key} is not done; run the whole plan") from error
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise CheckpointError(f"{path} cannot be read ({error}); remove it, and the job is done again") from error
 
 
 def _forget() -> None:

@@ -14,6 +14,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
+import psutil
 import torch
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.scripts import train
@@ -171,12 +172,12 @@ class Bench:
         for _ in range(10):
             child = start()
             time.sleep(rng.uniform(0.0, seconds))
-            family = [child.pid, *descendants(child.pid)]
-            with suppress(ProcessLookupError):  # it has ended
-                victims = [pid for pid in family if b"resource_tracker" not in command_line(pid)]
-                os.kill(rng.choice(victims), signal.SIGKILL)
+            children: list[psutil.Process] = []
+            with suppress(psutil.NoSuchProcess):  # it has ended
+                family = [parent := psutil.Process(child.pid), *(children := parent.children(recursive=True))]
+                rng.choice([each for each in family if "resource_tracker" not in " ".join(each.cmdline())]).kill()
             code, until = self.ended(child), time.monotonic() + LONGEST
-            while any(command_line(pid) for pid in family[1:]):
+            while any(map(running, children)):
                 if time.monotonic() > until:
                     self.fail("a process outlived the one that was killed")
                 time.sleep(0.1)
@@ -187,16 +188,8 @@ class Bench:
         return False
 
 
-def command_line(pid: int) -> bytes:
-    """Words of a running process; empty if there is none."""
-    with suppress(OSError):
-        return Path(f"/proc/{pid}/cmdline").read_bytes()
-    return b""
-
-
-def descendants(pid: int) -> list[int]:
-    """Processes that a process started, and theirs."""
-    with suppress(OSError):
-        children = map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split())
-        return [each for child in children for each in (child, *descendants(child))]
-    return []
+def running(process: psutil.Process) -> bool:
+    """Whether a process is there, and no zombie that no one has waited for."""
+    with suppress(psutil.NoSuchProcess):
+        return bool(process.status() != psutil.STATUS_ZOMBIE)
+    return False

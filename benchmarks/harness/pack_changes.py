@@ -7,7 +7,7 @@ import json
 import random
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -34,11 +34,6 @@ class Pack:
             bodies.append(content[at : at + size])
             at += size
         return cls(meta, bodies)
-
-
-def with_header(text: bytes, bodies: Iterable[bytes]) -> bytes:
-    """A file of a header and sections, with a valid checksum of the header."""
-    return b"\x89SUNDAE\n" + struct.pack("<II", 3, len(text)) + hashlib.sha256(text).digest() + text + b"".join(bodies)
 
 
 RAW = "@@RAW@@"
@@ -68,13 +63,6 @@ def at(meta: Json, path: tuple[Json, ...]) -> Json:
     return meta
 
 
-def chosen_place(pack: Pack, rng: random.Random) -> tuple[Json, ...]:
-    """A place of the header; places in the list of sections are many, and less than half of the choices."""
-    paths = list(places(pack.meta))
-    listed = rng.random() < 0.3
-    return rng.choice([path for path in paths if (path[0] == "sections") == listed])
-
-
 def other_value(value: Json, rng: random.Random) -> Json:
     """A value in place of another: near it, of its kind, or of any kind."""
     kind = rng.randrange(6)
@@ -93,7 +81,9 @@ def other_value(value: Json, rng: random.Random) -> Json:
 
 
 def change_value(pack: Pack, rng: random.Random) -> None:
-    *front, last = chosen_place(pack, rng)
+    """Change one value; places in the list of sections are many, and less than half of the choices."""
+    listed = rng.random() < 0.3
+    *front, last = rng.choice([path for path in places(pack.meta) if (path[0] == "sections") == listed])
     place = at(pack.meta, tuple(front))
     place[last] = other_value(place[last], rng)
 
@@ -181,4 +171,5 @@ def mutated(good: Pack, seed: int) -> bytes:
         for section, body in zip(pack.meta["sections"], pack.bodies, strict=True):
             section["sha256"] = hashlib.sha256(body).hexdigest()
     text = json.dumps(pack.meta).encode().replace(f'"{RAW}"'.encode(), rng.choice(TEXTS).encode())
-    return with_header(text, pack.bodies)
+    start = b"\x89SUNDAE\n" + struct.pack("<II", 3, len(text)) + hashlib.sha256(text).digest()
+    return b"".join([start, text, *pack.bodies])

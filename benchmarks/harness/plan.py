@@ -121,28 +121,18 @@ def _warmup(base: Job, arm: Arm) -> Job:
 def _job(base: Job, arm: Arm, ratio: float | None) -> Job:
     """The training of an arm at one share, or at its own."""
     steps, share = str(arm.steps), "" if ratio is None else f"{ratio:g}"
-    options: dict[str, Words]
+    options: dict[str, Words] = {} if ratio is None else {"pipeline.model.pruning.keep-ratio": (share,)}
     if arm.kind == "branch":
-        options = {
-            "pipeline.model.pruning.keep-ratio": (share,),
+        options |= {
             "pipeline.model.pruning.seed": (str(base.seed),),
             # Rates decay over the branch.
             "optimizers.means.scheduler.max-steps": (steps,),
             "optimizers.compensation.scheduler.max-steps": (steps,),
             "pipeline.model.evaluate-prune": ("False",),
         }
-    else:
-        options = {} if ratio is None else {"pipeline.model.pruning.keep-ratio": (share,)}
-    return replace(
-        base,
-        key=f"{base.scene}-{arm.name}-{'' if ratio is None else f'{100 * ratio:g}pct-'}s{base.seed}",
-        kind=arm.kind,
-        arm=arm.name,
-        method=arm.method,
-        steps=arm.steps,
-        keep_ratio=ratio,
-        options=_command({**options, **arm.options}),
-    )
+    key = f"{base.scene}-{arm.name}-{'' if ratio is None else f'{100 * ratio:g}pct-'}s{base.seed}"
+    made = replace(base, key=key, kind=arm.kind, arm=arm.name, method=arm.method, steps=arm.steps, keep_ratio=ratio)
+    return replace(made, options=_command({**options, **arm.options}))
 
 
 def _command(options: Mapping[str, Words]) -> Words:

@@ -145,7 +145,10 @@ def run_jobs(
         try:
             if job.needs in failed:
                 raise SundaeError(f"its warm-up has failed: {job.needs}")
-            _describe(job, out)
+            folder = job_folder(out, job.key)
+            with writing(f"cannot make {folder}"):
+                folder.mkdir(parents=True, exist_ok=True)
+            write_text(folder / "job.json", json.dumps(asdict(job)) + "\n")
             runner(job, out)
         except SundaeError as error:
             failed[job.key] = str(error)
@@ -174,13 +177,6 @@ def spawn(job: Job, out: Path) -> None:
         if last.startswith(ERROR):  # an error of the package, complete in one line
             raise SundaeError(f"{last.removeprefix(ERROR)} (log: {log})")
         raise SundaeError(f"the job failed with {code}; {log} ends with:\n{end}")
-
-
-def _describe(job: Job, out: Path) -> None:
-    folder = job_folder(out, job.key)
-    with writing(f"cannot make {folder}"):
-        folder.mkdir(parents=True, exist_ok=True)
-    write_text(folder / "job.json", json.dumps(asdict(job)) + "\n")
 
 
 def _finished(out: Path) -> dict[str, Result]:

@@ -192,8 +192,7 @@ class Server:
     def stop(self) -> None:
         """Terminate it; kill it after ten seconds."""
         self.process.terminate()
-        try:
+        with suppress(subprocess.TimeoutExpired):
             self.process.wait(10)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
+        self.process.kill()  # does nothing to one that has ended
+        self.process.wait()
