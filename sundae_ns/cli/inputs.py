@@ -140,17 +140,11 @@ def reduced(
         most, suffix = int(wishes.max_mb * MEGABYTE), out.suffix.lower()
         # All columns of a .ply stay.
         forms = forms_of(scene, suffix)[: 1 if copies_rows(source, out) or not rounds else None]
-        return after(
-            *prune_to_bytes(
-                scene,
-                most,
-                lambda pruned, form, folder: after(pruned, form).write(source, folder / out.name),
-                forms,
-                cameras,
-                rule,
-                progress=True,
-            )
-        )
+
+        def write(pruned: PrunedScene, form: Form, folder: Path) -> int:
+            return after(pruned, form).write(source, folder / out.name)
+
+        return after(*prune_to_bytes(scene, most, write, forms, cameras, rule, progress=True))
 
 
 def open_run(run: Path, **options: Any) -> Scene:
@@ -167,9 +161,8 @@ def prepared_page(
     source: Path, wishes: Wishes, details: SceneDetails, before: Left | None = None
 ) -> tuple[Scene, bytes]:
     """What the options leave of a scene, and the packed file that a page of it shows; a packed one stays as it is."""
-    left = reduced(
-        before or opened(source, wishes, details, capture=True), source, wishes, details, out=Path("page.html")
-    )
+    before = before or opened(source, wishes, details, capture=True)
+    left = reduced(before, source, wishes, details, out=Path("page.html"))
     if kind_of(source) != "packed" or wishes.cleans or wishes.reduces or details.no_head:
         return left.stated, packed_of(left.stated, left.precision)
     packed = source.read_bytes()

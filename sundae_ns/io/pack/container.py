@@ -25,6 +25,7 @@ import hashlib
 import json
 import math
 import struct
+import sys
 import zlib
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -33,12 +34,18 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jsonschema
 import numpy as np
 from numpy.typing import NDArray
 
 from sundae_ns.core.errors import PackError, reading, regular
 from sundae_ns.io.budget import afford
+
+# With Jupyter's packages jsonschema compiles a grammar for two seconds, of a format that no schema here has.
+sys.modules.setdefault("rfc3987_syntax", None)  # type: ignore[arg-type]
+import jsonschema  # noqa: E402
+
+if sys.modules["rfc3987_syntax"] is None:
+    del sys.modules["rfc3987_syntax"]
 
 FORMAT: dict[str, Any] = json.loads(resources.files(__package__).joinpath("format.json").read_text(encoding="utf-8"))
 """``limits`` of files, schemas of ``container``, ``header`` and ``model``, and ``sections`` by codec and part."""
