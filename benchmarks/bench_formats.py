@@ -33,7 +33,7 @@ from sundae_ns.core.gaussians import bytes_of
 from sundae_ns.head.head import bytes_of_module
 from sundae_ns.plugin.dataparsers import camera_of
 from sundae_ns.plugin.finished_runs import Opened, load_model, load_run
-from sundae_ns.scene.packing import packed_bytes
+from sundae_ns.scene.page import packed_of
 
 COLUMNS = tuple("capture method format program bytes psnr ssim primitives seed command".split())
 PLACE = ("capture", "method", "format", "program", "seed")
@@ -63,7 +63,7 @@ def packed_files(run: Path, scene: sn.Scene, folder: Path, data: Path | None, pr
         sn.save(scene, folder / f"scene{kind}")
         yield Packed(folder / f"scene{kind}", OURS, f"sundae export RUN -o scene{kind}")
     packed = folder / "scene.sundae"
-    packed.write_bytes(packed_bytes(load_run(run, data=data)))
+    packed.write_bytes(packed_of(load_run(run, data=data)))
     yield Packed(packed, OURS, "sundae pack RUN -o scene.sundae")
     if program is not None:
         theirs = folder / "theirs.sog"

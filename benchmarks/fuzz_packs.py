@@ -35,8 +35,8 @@ from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.head.head import CompensationHead, HeadConfig
 from sundae_ns.io.pack.packed_scene import read_scene
 from sundae_ns.scene.initialization import from_points
-from sundae_ns.scene.packing import packed_bytes, scene_of
-from sundae_ns.scene.page import page_of
+from sundae_ns.scene.packing import scene_of
+from sundae_ns.scene.page import packed_of, page_of
 
 SECONDS = 60  # time limit of one verdict; it takes milliseconds, so only a hang reaches it, and ends the script
 POINTS = 60
@@ -56,7 +56,7 @@ def scenes() -> list[Pack]:
     """Small scenes of every kind: harmonics, logits, antialiased, and both heads."""
     residual, features = ("residual", 1, 3), ("features", 2, 4)
     kinds = [(3, None), (0, None), (1, residual), (4, None), (1, features), (2, None)]
-    return [Pack.of(packed_bytes(_scene(*kind))) for kind in kinds]
+    return [Pack.of(packed_of(_scene(*kind))) for kind in kinds]
 
 
 def _scene(degree: int, kind: tuple[Any, int, int] | None) -> sn.Scene:

@@ -53,14 +53,13 @@ def demo(
         with redirect_stdout(log), redirect_stderr(log):
             from sundae_ns.plugin.finished_runs import load_model, load_run
             from sundae_ns.report.measure import Subject, markdown, measure
-            from sundae_ns.scene.packing import packed_bytes
-            from sundae_ns.scene.page import write_page
+            from sundae_ns.scene.page import packed_of, write_page
 
             subject = Subject.of_run(load_model(run))
             measured = measure(subject, label="demo", lpips=Lpips(), warmup=1, repeats=3)
             write_text(out / "eval.json", json.dumps(measured.as_json(), indent=2) + "\n")
             finished = load_run(run)
-            packed = packed_bytes(finished)
+            packed = packed_of(finished)
             write_bytes(out / "scene.sundae", packed)
             write_page(out / "scene.html", ("sundae demo", finished, packed))
 

@@ -17,8 +17,8 @@ from sundae_ns.graph.neighbors import knn
 
 NEAREST = 0.01  # Share of the sparse points that may be nearer to a camera than the scene: some of them are wrong
 FREE = 2 / 3  # share of that distance which is taken to be empty
-# Something near has this many sparse points within this share of the empty distance; wrong points lie alone.
-SUPPORT, REACH = 3, 0.5
+SUPPORT, REACH = 3, 0.5  # Something near has as many sparse points within this share of the empty distance
+STRENGTH = 0.25  # Of a cleaning, from 0 to 1, unless it is told otherwise
 MOST = 0.05  # Largest share that can be floaters; with more of them the points do not say where the scene is
 
 

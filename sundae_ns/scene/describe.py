@@ -22,7 +22,7 @@ from sundae_ns.io.config_file import find_config
 from sundae_ns.io.formats import METAS, kind_of, kind_of_gaussians
 from sundae_ns.io.pack.container import read_header
 from sundae_ns.scene.cameras import spread
-from sundae_ns.scene.prune_scene import at_most, floater_mask, weights_in
+from sundae_ns.scene.prune_scene import at_most, floater_mask, for_cleaning, weights_in
 from sundae_ns.scene.scene import Scene
 from sundae_ns.scene.virtual_cameras import by_device, virtual_cameras
 
@@ -61,8 +61,7 @@ def describe(
     """
     scene = dataclasses.replace(scene, gaussians=sanitise(scene.gaussians).gaussians)
     gaussians, cameras = scene.gaussians, cameras or scene.cameras
-    small = [camera.zoomed(min(512 / max(camera.width, camera.height), 1.0)) for camera in cameras]  # as a cleaning
-    views = small or virtual_cameras(scene, LOOKING)
+    views = for_cleaning(cameras) or virtual_cameras(scene, LOOKING)
     weights, means = weights_in(scene, views, console=console), gaussians["means"].double()
     stated = None
     if path.is_file():  # a .sog holds its meta.json anywhere
@@ -82,7 +81,7 @@ def describe(
         "bytes_by_attribute": bytes_by_attribute(scene, path),
         "seen_by": f"{len(views)} {'cameras' if cameras else 'virtual cameras'}",
         "invisible": float((weights <= 0).float().mean()),
-        "floaters": int((floater_mask(scene, (), 0.5) | ((weights <= 0) & bool(cameras))).sum()),
+        "floaters": int((floater_mask(scene, ()) | ((weights <= 0) & bool(cameras))).sum()),
         "crop": box_of(means, weights),
     }
 

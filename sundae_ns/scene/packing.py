@@ -14,9 +14,8 @@ from sundae_ns.core.errors import ConfigError, PackError
 from sundae_ns.core.gaussians import FEATURES, Gaussians, sanitise
 from sundae_ns.head.head import CompensationHead, HeadConfig
 from sundae_ns.io.pack.codecs import Sensitivity
-from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.io.pack.container import FORMAT, fault
-from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
+from sundae_ns.io.pack.packed_scene import PackedScene
 from sundae_ns.rasterize.reference import harmonic_basis
 from sundae_ns.scene.cameras import is_frame, spread
 from sundae_ns.scene.render import GaussianSource, render_view
@@ -76,11 +75,6 @@ def contents_of(scene: Scene) -> PackedScene:
     if not scene.cameras:
         return PackedScene(gaussians, head, None, meta, None)
     return PackedScene(gaussians, head, arrays_of_cameras(scene.cameras), meta, sensitivity_of(scene, scene.cameras))
-
-
-def packed_bytes(scene: Scene, config: PackConfig | None = None) -> bytes:
-    """The packed file of a scene, by default with default settings."""
-    return pack_bytes(*fit_scene(contents_of(scene), config))[0]
 
 
 def stated_start(scene: Scene) -> dict[str, Any]:

@@ -63,9 +63,10 @@ Shown = tuple[str, Scene, bytes]  # a scene on a page: its name, itself, and its
 
 def packed_of(scene: Scene, config: PackConfig | None = None) -> bytes:
     """The packed file of a scene, by default with default settings."""
-    from sundae_ns.scene.packing import packed_bytes  # its encoder needs a compiler, which other files do not
+    from sundae_ns.io.pack.packed_scene import fit_scene, pack_bytes  # their encoder needs a compiler
+    from sundae_ns.scene.packing import contents_of
 
-    return packed_bytes(scene, config)
+    return pack_bytes(*fit_scene(contents_of(scene), config))[0]
 
 
 def page_of(*shown: Shown, views: Mapping[str, View] | None = None) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,9 +17,10 @@ from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.core.gaussians import Gaussians, sanitise
 from sundae_ns.core.values import AnyArray, numbers, whole
+from sundae_ns.cuda.adam import Update, adam_step
 from sundae_ns.graph.graph import NeighborGraph
 from sundae_ns.pruning.decision import prune_gaussians
-from sundae_ns.pruning.floaters import floater_odds
+from sundae_ns.pruning.floaters import STRENGTH, floater_odds
 from sundae_ns.pruning.rule import PruneRule, kept_count
 from sundae_ns.rasterize.interface import rasterize_cameras
 from sundae_ns.scene.render import GaussianSource, RenderSettings, TrainingCamera, contribution, pass_inputs
@@ -148,10 +149,8 @@ def weights_in(
     source, settings = GaussianSource(sized.gaussians), scene.settings(head=False)
     weights = contribution(source, views, scene.background, settings, count, images=images, console=console)
     if not bool((weights > 0).any()):
-        raise DataError(
-            f"{len(scaled)} views see none of {scene.num_gaussians:,} Gaussians; "
-            "give cameras that look at the scene, or export it again"
-        )
+        none = f"{len(scaled)} views see none of {scene.num_gaussians:,} Gaussians"
+        raise DataError(f"{none}; give cameras that look at the scene, or export it again")
     return weights
 
 
@@ -182,12 +181,13 @@ def refit(
     # The rates are the size of the first steps, for a prune to 15% or fewer; with more Gaussians less is left to fit.
     rates = {"means": 0.014, "scales": 0.007, "quats": 0.007, "opacities": 0.035, "features_dc": 0.014}
     factor *= min(1.0, 0.15 * full.num_gaussians / small.num_gaussians)
+    units: dict[str, Any] = {**rates, "means": size * rates["means"]}  # centres move in sizes of their Gaussian
     moved = {name: torch.zeros_like(small[name], requires_grad=True) for name in rates}
-    moments = {name: (torch.zeros_like(small[name]), torch.zeros_like(small[name])) for name in rates}
+    running = [(torch.zeros_like(value), torch.zeros_like(value), size.new_zeros(())) for value in moved.values()]
+    adam = {"betas": (0.9, 0.99), "eps": 1e-15, "weight_decay": 0.0}
 
     def fitted() -> Gaussians:
-        # Centres move in sizes of their Gaussian.
-        return small.replaced({n: small[n] + (size * step if n == "means" else step) for n, step in moved.items()})
+        return small.replaced({name: small[name] + units[name] * step for name, step in moved.items()})
 
     def error(gaussians: Gaussians, chosen: Sequence[int]) -> Tensor:
         """Sum of the mean squared errors of some cameras."""
@@ -201,13 +201,11 @@ def refit(
         for i in progress.track(range(steps), description="Refit of Gaussians"):
             with torch.enable_grad():
                 loss = error(fitted(), [trained[k % len(trained)] for k in range(i * views, (i + 1) * views)])
-            # Adam written out: torch.optim imports a compiler, which takes two seconds.
-            for name, gradient in zip(moved, torch.autograd.grad(loss, list(moved.values())), strict=True):
-                mean, square = moments[name]
-                mean.lerp_(gradient, 0.1)
-                square.lerp_(gradient.square(), 0.01)
-                rate = factor * rates[name] * (1 - i / steps) / (1 - 0.9 ** (i + 1))
-                moved[name] -= rate * mean / ((square / (1 - 0.99 ** (i + 1))).sqrt() + 1e-15)
+            # Not by torch.optim, which imports a compiler for two seconds.
+            gradients = torch.autograd.grad(loss, list(moved.values()))
+            rows = zip(moved.values(), gradients, running, strict=True)
+            updates = [Update(value, gradient.contiguous(), *state) for value, gradient, state in rows]
+            adam_step([(adam, updates)], size.new_full((1,), factor * (1 - i / steps)), None)
     gaussians = fitted()
     before, after = (error(each, judges) for each in (small, gaussians))
     return gaussians if bool(after < before) else small  # small too if the fitted ones are not finite
@@ -274,7 +272,9 @@ def crop(scene: Scene, low: AnyArray, high: AnyArray) -> Scene:
     return scene[crop_mask(scene, low, high)]
 
 
-def remove_floaters(scene: Scene, strength: float = 0.25, *, cameras: Camera | Iterable[Camera] | None = None) -> Scene:
+def remove_floaters(
+    scene: Scene, strength: float = STRENGTH, *, cameras: Camera | Iterable[Camera] | None = None
+) -> Scene:
     """The scene without what floats or is not seen.
 
     Args:
@@ -316,16 +316,21 @@ def crop_mask(scene: Scene, low: AnyArray, high: AnyArray) -> Tensor:
         finite = means[means.isfinite().all(dim=1)].cpu().numpy()
         if not len(finite):
             raise DataError("no Gaussian is in the box, because none is finite; export the scene again")
-        digits = 3 if scene.offset is None else 10
-        corners = (
-            " ".join(f"{value:.{digits}g}" for value in corner) for corner in np.quantile(finite, (0.05, 0.95), axis=0)
-        )
+        digits, ends = 3 if scene.offset is None else 10, np.quantile(finite, (0.05, 0.95), axis=0)
+        corners = (" ".join(f"{value:.{digits}g}" for value in corner) for corner in ends)
         raise DataError(f"no Gaussian is in the box; most of them lie between {' and '.join(corners)}")
     return inside
 
 
+def for_cleaning(cameras: Sequence[Camera]) -> list[Camera]:
+    """The cameras with images of at most 512 pixels a side, which tell what is seen at all."""
+    return [camera.zoomed(min(512 / max(camera.width, camera.height), 1.0)) for camera in cameras]
+
+
 @torch.no_grad()
-def floater_mask(scene: Scene, cameras: Sequence[Camera], strength: float, console: Console | None = None) -> Tensor:
+def floater_mask(
+    scene: Scene, cameras: Sequence[Camera], strength: float = STRENGTH, console: Console | None = None
+) -> Tensor:
     """True for floaters, bool ``[N]``; arguments and errors as for :func:`remove_floaters`."""
     if not 0 <= strength <= 1:
         raise ConfigError(f"the strength of remove-floaters is {strength}; give 0 (careful) to 1 (thorough)")
@@ -334,6 +339,6 @@ def floater_mask(scene: Scene, cameras: Sequence[Camera], strength: float, conso
         raise DataError("no Gaussian is finite; export the scene again")
     floats = floater_odds(sanitised.gaussians) > 6.5 - 5 * strength  # logarithms
     if cameras:
-        small = [camera.zoomed(min(512 / max(camera.width, camera.height), 1.0)) for camera in cameras]
-        floats |= weights_in(dataclasses.replace(scene, gaussians=sanitised.gaussians), small, console=console) <= 0
+        usable = dataclasses.replace(scene, gaussians=sanitised.gaussians)
+        floats |= weights_in(usable, for_cleaning(cameras), console=console) <= 0
     return ~within(sanitised.mask, ~floats)

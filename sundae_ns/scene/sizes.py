@@ -28,7 +28,7 @@ from sundae_ns.pruning.merge import gaussian_graph
 from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.scene.prune_scene import PrunedScene, at_most, prune_with_mask, weights_in
 from sundae_ns.scene.scene import Scene, measure, render
-from sundae_ns.scene.virtual_cameras import split, virtual_cameras
+from sundae_ns.scene.virtual_cameras import split
 
 SAMPLED = 64, 8192  # random Gaussians of two files, which tell the bytes of each more one
 LEAST, AIM = 0.97, 0.985  # shares of the size: what is near enough, and what each file aims at
@@ -71,15 +71,15 @@ def prune_to_bytes(
     most: int,
     write: Written,
     forms: Sequence[Form],
-    cameras: Sequence[Camera] | None,
+    cameras: Sequence[Camera],
     rule: PruneRule,
     *,
     progress: bool = False,
 ) -> tuple[PrunedScene, Form]:
     """The scene and the form of a file of 97 to 100% of ``most`` bytes; of fewer if that is all.
 
-    The scene is finite. ``cameras`` as for :func:`sundae_ns.prune`; every eighth compares the forms. ``progress`` shows
-    bars and remarks on stderr. ``ConfigError`` if hardly a Gaussian fits.
+    The scene is finite. Every eighth of the ``cameras`` compares the forms. ``progress`` shows bars and remarks on
+    stderr. ``ConfigError`` if hardly a Gaussian fits.
     """
     n, packs = scene.num_gaussians, len({form.power for form in forms}) > 1
     order = torch.randperm(n, generator=torch.Generator().manual_seed(0)).to(scene.device)
@@ -110,21 +110,20 @@ def prune_to_bytes(
         possible = [i for i, count in enumerate(counts) if count > 0]
         if not possible:
             raise ConfigError(f"a file without Gaussians has {lines[-1][0]:,.0f} bytes; give more than {most:,}")
-        given = cameras if cameras is not None else scene.cameras or virtual_cameras(scene)
         weights, graph = None, gaussian_graph(scene.gaussians, rule) if rule.uses_graph and n > 1 else None
         if rule.uses_contribution:
             console = Console(stderr=True) if progress else None
             middle = max(sorted(counts)[len(counts) // 2], 1)
-            weights = weights_in(scene, given, middle if rule.uses_detail else None, console)
+            weights = weights_in(scene, cameras, middle if rule.uses_detail else None, console)
 
         @cache
         def cut(count: int, fit: bool = False) -> PrunedScene:
             options = {"progress": progress, "fit": fit, "weights": weights, "graph": graph}
-            return prune_with_mask(scene, None, count, given, rule, **options)  # type: ignore[arg-type]
+            return prune_with_mask(scene, None, count, cameras, rule, **options)  # type: ignore[arg-type]
 
         best = possible[0]
         if len(possible) > 1:
-            judges = [at_most(camera, PIXELS) for camera in (split(given)[1] or list(given))[:JUDGES]]
+            judges = [at_most(camera, PIXELS) for camera in (split(cameras)[1] or list(cameras))[:JUDGES]]
             images, as_read = [render(scene, camera).rgb for camera in judges], _as_packed if packs else stated
             best = max(possible, key=lambda i: measure(as_read(cut(counts[i]).scene, forms[i]), images, judges).psnr)
         fixed, form, count = lines[best][0], forms[best], counts[best]

@@ -30,10 +30,13 @@ from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
 log = logging.getLogger(__name__)
 
-USUAL_SHARE = 0.1  # Share that a prune keeps unless it is told otherwise; also where trials cannot decide
+USUAL_SHARE = 0.1  # Share that a prune keeps unless it is told otherwise
+MANY_VIEWS = 32  # With as many, counts are tried, and no length is: captures of 43 training views gain to the end
+FEW_SHARE, USUAL_VIEWS = 0.05, 24  # Least share of the Gaussians that few views keep, and as many keep the usual share
 NEVER = -1  # Value of state["pruned_at"] before the first prune
 UNPRUNED = {"pruned_at": NEVER, "num_prunes": 0, "peak": 0}  # Running state at the start; the peak is of Gaussians
-COUNT = "count"  # Key of the running state with the number that trials have chosen; 0 for the usual share
+COUNT, VIEWS = "count", "views"
+"""Keys of the running state: the number that trials have chosen, 0 where they cannot, and of training views."""
 LEAST_OPACITY = 0.005  # Of Gaussians that share the appearance of one; 3DGS-MCMC counts lower ones as dead
 
 Running = MutableMapping[str, Any]
@@ -116,7 +119,7 @@ class PruningConfig(PruneRule):
         if self.target_gaussians is not None:
             return min(self.target_gaussians, n)
         chosen = state.get(COUNT, 0) if self.decides else 0
-        share = USUAL_SHARE if self.keep_ratio is None else self.keep_ratio
+        share = usual_share(state.get(VIEWS, MANY_VIEWS)) if self.keep_ratio is None else self.keep_ratio
         count = min(chosen, n) if chosen else kept_count(share, n)
         return count if self.max_gaussians is None else min(count, self.max_gaussians)
 
@@ -142,6 +145,11 @@ class PruningConfig(PruneRule):
         for refused, message in refusals:
             if refused:
                 raise ConfigError(message)
+
+
+def usual_share(num_views: int) -> float:
+    """Share of the Gaussians that a prune keeps where trials cannot decide."""
+    return USUAL_SHARE if num_views >= MANY_VIEWS else max(FEW_SHARE, USUAL_SHARE * num_views / USUAL_VIEWS)
 
 
 def write_record(run: TrainingRun, name: str, record: Any) -> None:

@@ -47,7 +47,7 @@ from sundae_ns.train.averaging import AVERAGED_EVERY, RunningMean, weights_of
 from sundae_ns.train.choice import HEADS, HeadGain, HeldOutQuality, Tolerance, Tried, mean_quality
 from sundae_ns.train.curve import RECORD, CurvePoint, curve_table
 from sundae_ns.train.densification import Densification
-from sundae_ns.train.pruning import COUNT, USUAL_SHARE, prune_to, write_record
+from sundae_ns.train.pruning import COUNT, MANY_VIEWS, USUAL_SHARE, VIEWS, prune_to, usual_share, write_record
 from sundae_ns.train.schedules import limit_rise, notify_pruned, put_restarts, restarts
 from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
@@ -55,8 +55,6 @@ log = logging.getLogger(__name__)
 
 SHARES: tuple[float, ...] = (1.0, 0.4, 0.2, 0.1, 0.05, 0.025)  # Of the Gaussians that are tried
 COUNT_SHARE = 0.02  # Length of a trial of a count, and of a window of a length, as a share of the schedule
-MANY_VIEWS = 32  # With as many, counts are tried, and no length is: captures of 43 training views gain to the end
-FEW_SHARE, USUAL_VIEWS = 0.05, 24  # Least share of the Gaussians that few views keep, and as many keep the usual share
 FEWEST_VIEWS = 6  # Fewer cannot judge a head
 MOST_CONTRIBUTING = 32  # Training views that the prune of a trial looks at
 MOST_TRIALS = 0.45  # Largest share of the steps after the prune that trials of counts, and of a head in them, may take
@@ -179,7 +177,6 @@ class Trials(Callback):
         self._mean = RunningMean()
         self._window = 1  # Steps of a trial of a count, and between two measurements of a length
         self._judges: list[int] = []  # Views that are held out for the trials of counts
-        self._few_share: float | None = None  # Of the Gaussians that few training views keep; None with many
         self._folds: list[list[int]] = []  # Views that are held out for the trials of each head, one after another
         self._length = 1  # Steps of a trial of a head
         self._densification = densification
@@ -251,12 +248,12 @@ class Trials(Callback):
         self._window, indices = max(round(COUNT_SHARE * progress.steps), 1), run.view_indices()
         self._folds, self._length = choice.plan_heads(indices, progress.steps)
         self._judges = choice.spread_cameras(indices, min(choice.MOST_HELD_OUT, num_views // choice.HELD_OUT_EVERY), 0)
-        if num_views < MANY_VIEWS:
-            self._few_share = max(FEW_SHARE, USUAL_SHARE * num_views / USUAL_VIEWS)
+        state.pruning[VIEWS] = num_views
         if self.config.decides and "count" not in progress.chosen:
             steps, left = len(SHARES) * self._window, _steps_of(run) - self.config.prune_at
             steps += 2 * self._length if self.decides_head else 0
             obstacles = {
+                f"{num_views} training views are too few to compare counts": num_views < MANY_VIEWS,
                 "trials of counts need a single GPU": several,
                 "a warm start has seen all training views before": state.offset > 0,
                 "the steps after the prune are too few to compare counts": steps > MOST_TRIALS * left,
@@ -264,11 +261,8 @@ class Trials(Callback):
             reason = next((reason for reason, holds in obstacles.items() if holds), None)
             if state.pruning["num_prunes"] and not progress.stage:  # by a share that was given
                 progress.chosen["count"] = 0
-            elif self._few_share is not None:  # of as many as there are at the prune
-                _warn_of_share(self._few_share, f"{num_views} training views are too few to compare counts")
             elif reason is not None:
-                _warn_of_share(USUAL_SHARE, reason)
-                self._set_count(run, 0)
+                self._keep_usual(run, reason)
             else:
                 self.coming["count"] = self._judges
         if self.decides_head and "head" not in progress.chosen:
@@ -291,10 +285,7 @@ class Trials(Callback):
         if progress.stage in ("count", "tenth"):
             self._go_on(run)
         elif self.config.decides and "count" not in progress.chosen and run.state.schedule_step >= self.config.prune_at:
-            if self._few_share is None:
-                self._begin_counts(run)
-            else:
-                self._set_count(run, kept_count(self._few_share, run.source.total))
+            self._begin_counts(run)
 
     def after_prune(self, run: TrainingRun) -> None:
         """Try heads and lengths, once the schedule has pruned."""
@@ -488,8 +479,7 @@ class Trials(Callback):
         """Choose a count, and let the schedule prune to it."""
         progress = self.progress
         if not curve:
-            _warn_of_share(USUAL_SHARE, _MASKED)
-            self._set_count(run, 0)
+            self._keep_usual(run, _MASKED)
             return
         count, reason = self._count_of(curve)
         self._set_count(run, count)
@@ -509,6 +499,11 @@ class Trials(Callback):
             log.info(f"a tenth of the Gaussians after {self._length:,} steps: {_in_words(figures)}")
             record["head"] = {"pays": progress.chosen["tenth"], "steps_per_trial": self._length, **figures}
         self._record(run, count=record)
+
+    def _keep_usual(self, run: TrainingRun, reason: str) -> None:
+        kept = f"pruning keeps {usual_share(run.state.pruning[VIEWS]):.0%} of the Gaussians"
+        log.warning(f"{kept}: {reason}; --pipeline.model.pruning.keep-ratio sets it")
+        self._set_count(run, 0)
 
     def _set_count(self, run: TrainingRun, count: int) -> None:
         """End the trials of counts; with 0 the schedule keeps the usual share."""
@@ -637,10 +632,6 @@ class AfterPrune(Callback):
     def after_step(self, run: TrainingRun) -> None:
         """Try heads and lengths."""
         self._trials.after_prune(run)
-
-
-def _warn_of_share(share: float, reason: str) -> None:
-    log.warning(f"pruning keeps {share:.0%} of the Gaussians: {reason}; --pipeline.model.pruning.keep-ratio sets it")
 
 
 def _steps_of(run: TrainingRun) -> int:

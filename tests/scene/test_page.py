@@ -25,8 +25,8 @@ from sundae_ns.core.errors import PackError
 from sundae_ns.io.pack.packed_scene import read_scene
 from sundae_ns.rasterize.reference import project
 from sundae_ns.scene import page as page_module
-from sundae_ns.scene.packing import packed_bytes, scene_of
-from sundae_ns.scene.page import page_of, render_first, write_page
+from sundae_ns.scene.packing import scene_of
+from sundae_ns.scene.page import packed_of, page_of, render_first, write_page
 from sundae_ns.scene.render import pass_inputs
 
 ROOT = Path(__file__).parents[2]
@@ -287,7 +287,7 @@ def frame_of(text):
 def test_the_page_in_the_frame_holds_the_scene(scene):
     frame = frame_of(sn.show(scene, height=321)._repr_html_())
     assert (frame["height"], frame["width"]) == ("321", "100%")
-    assert frame["srcdoc"] == page_of(("Scene", scene, packed_bytes(scene)))
+    assert frame["srcdoc"] == page_of(("Scene", scene, packed_of(scene)))
 
 
 def test_a_hostile_title_stays_text(scene):
