@@ -24,7 +24,8 @@ from sundae_ns.scene.virtual_cameras import middle_and_reach, usable
 
 PLANTED, HELD_OUT = 100, 12  # floaters of each kind, and cameras
 KINDS = ("near", "shell", "haze", "spikes")
-COLUMNS = ("field", "kind", "planted", "removed", "others_removed", "psnr_lost")
+COLUMNS = ("field", "strength", "kind", "planted", "removed", "others_removed", "psnr_lost")
+STRENGTHS = (0.25, 0.5)
 
 
 def points_in_front(
@@ -75,18 +76,19 @@ def planted(scene: sn.Scene, kind: str, cameras: Sequence[sn.Camera], seed: int)
 
 
 def rows_of(path: Path) -> Iterator[tuple[object, ...]]:
-    """One row a kind, and one for all planted at once, whose mask gives what is lost."""
+    """For each strength a row a kind, and one for all planted at once, whose mask gives what is lost."""
     scene = sn.load(path)
     cameras = sn.virtual_cameras(scene, HELD_OUT, seed=7, size=256)
     dirty = scene
     for seed, kind in enumerate(KINDS):
         dirty = planted(dirty, kind, cameras, seed)
-    n = len(floats := floater_mask(dirty, (), 0.25)) - PLANTED * len(KINDS)
-    error = fmean(10 ** (-psnr / 10) for psnr in sn.measure(scene[~floats[:n]], scene, cameras).psnrs)
-    lost = f"{10 * math.log10(1 + error / 1e-3):.3f}"
-    for kind, part in zip(KINDS, floats[n:].split(PLANTED), strict=True):
-        yield path.stem, kind, PLANTED, int(part.sum()), "", ""
-    yield path.stem, "all", PLANTED * len(KINDS), int(floats[n:].sum()), int(floats[:n].sum()), lost
+    for strength in STRENGTHS:
+        n = len(floats := floater_mask(dirty, (), strength)) - PLANTED * len(KINDS)
+        error = fmean(10 ** (-psnr / 10) for psnr in sn.measure(scene[~floats[:n]], scene, cameras).psnrs)
+        lost = f"{10 * math.log10(1 + error / 1e-3):.3f}"
+        for kind, part in zip(KINDS, floats[n:].split(PLANTED), strict=True):
+            yield path.stem, strength, kind, PLANTED, int(part.sum()), "", ""
+        yield path.stem, strength, "all", PLANTED * len(KINDS), int(floats[n:].sum()), int(floats[:n].sum()), lost
 
 
 def main() -> None:
@@ -94,7 +96,7 @@ def main() -> None:
     parser.add_argument("fields", nargs="+", type=Path)
     parser.add_argument("-o", "--out", type=Path, required=True)
     options = parser.parse_args()
-    rows = Rows(options.out, COLUMNS, COLUMNS[:2])
+    rows = Rows(options.out, COLUMNS, COLUMNS[:3])
     for path in options.fields:
         for row in rows_of(path):
             rows.put(dict(zip(COLUMNS, row, strict=True)))
