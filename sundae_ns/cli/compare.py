@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import json
+import math
 import shlex
 import sys
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 from rich.markup import escape
 
 from sundae_ns.cli.inputs import chosen_cameras, is_run
-from sundae_ns.cli.options import Flag, Maybe, Overwrite, progress_bar
+from sundae_ns.cli.main import typed
+from sundae_ns.cli.options import File, Flag, Float, Int, Overwrite, progress_bar
 from sundae_ns.cli.refusals import check_folder, check_least
 from sundae_ns.core.errors import ConfigError, SundaeError
 from sundae_ns.core.files import write_files
@@ -25,21 +27,18 @@ from sundae_ns.scene.describe import HELD_OUT, held_out_cameras
 from sundae_ns.scene.load_save import load, save
 from sundae_ns.train.curve import read_count_curve
 
-if TYPE_CHECKING:
-    from sundae_ns.report.measure import Measured
-
 
 def compare(
     scenes: Annotated[list[Path], tyro.conf.Positional],
-    out: Annotated[Maybe[Path], tyro.conf.arg(aliases=["-o"])] = None,
-    data: Maybe[Path] = None,
-    cameras: Maybe[Path] = None,
+    out: Annotated[File, tyro.conf.arg(aliases=["-o"])] = None,
+    data: File = None,
+    cameras: File = None,
     num_cameras: int = HELD_OUT,
     formats: Flag = False,
-    min_psnr: Maybe[float] = None,
+    min_psnr: Float = None,
     lpips_net: Net = "alex",
     warmup: int = 3,
-    repeats: Maybe[int] = None,
+    repeats: Int = None,
     overwrite: Overwrite = False,
 ) -> int:
     """Compare scenes by PSNR, SSIM, worst view and bytes: a table, and a page with sliders.
@@ -65,19 +64,15 @@ def compare(
     check_least(warmup=(warmup, 0), repeats=(repeats, 0), num_cameras=(num_cameras, 1))
     scenes = sorted(scenes, key=lambda path: not is_run(path))  # a run says how photos are read
     photos = cameras is None and (data is not None or any(map(is_run, scenes)))
-    if not scenes:
-        raise ConfigError("there is nothing to compare; give two scenes, one with --formats, or runs")
+    if len(scenes) < (1 if photos or formats else 2):
+        given = f"{scenes[0]} is one scene" if scenes else "there is no scene"
+        raise ConfigError(f"{given}; give another, --formats, or --data with a capture")
     first = None if photos else load(scenes[0]).to(fastest_device())
-    if first is not None and len(scenes) == 1 and not formats:
-        raise ConfigError(f"{scenes[0]} is one scene; give another, --formats, or --data with a capture")
     from sundae_ns.report.measure import against_first, against_photos, csv_text, labels_of, markdown, measure
     from sundae_ns.report.report_page import ShownRun, report_page, shown_views
 
     repeats = (5 if photos else 0) if repeats is None else repeats
-    options: dict[str, object] = {"-o": out, "--data": data, "--cameras": cameras, "--num-cameras": num_cameras}
-    options |= {"--min-psnr": min_psnr, "--lpips-net": lpips_net, "--warmup": warmup, "--repeats": repeats}
-    words = [*scenes, *(word for pair in options.items() if pair[1] is not None for word in pair)]
-    command = shlex.join(map(str, ["sundae", "compare", *words, *(["--formats"] if formats else [])]))
+    command = shlex.join(["sundae", *typed])
     lpips = Lpips(lpips_net) if photos and lpips_weights(lpips_net)[1].is_file() else None
     missing = f"LPIPS: the weights of its net ({lpips_net}) are missing; sundae doctor says where to put them."
     notes = [missing] if photos and lpips is None else []
@@ -85,13 +80,11 @@ def compare(
     measured_by = partial(measure, lpips=lpips, warmup=warmup, repeats=repeats, command=command)
     with progress_bar() as progress, TemporaryDirectory() as folder:
         if formats:
-            task, stem = progress.add_task("Writing all formats", total=None), scenes[0].stem
-            whole = load(scenes[0]) if first is None else first.to("cpu")
-            others = [suffix for suffix in (*FORMATS, ".sundae") if suffix != scenes[0].suffix.lower()]
-            scenes = [scenes[0], *(Path(folder, f"{stem}{suffix}") for suffix in others)]
-            for path in scenes[1:]:
+            whole, suffix = load(scenes[0]) if first is None else first.to("cpu"), scenes[0].suffix.lower()
+            others = [Path(folder, scenes[0].stem + other) for other in (*FORMATS, ".sundae") if other != suffix]
+            for path in progress.track(others, description="Writing all formats"):
                 save(whole, path)
-            progress.remove_task(task)
+            scenes = [scenes[0], *others]
         opened = against_photos(data)
         if first is not None:
             chosen = held_out_cameras(first, chosen_cameras(first, cameras, num_cameras), num_cameras)
@@ -111,9 +104,8 @@ def compare(
             progress.remove_task(task)
     if not done:
         raise failures[0]
-    groups: dict[str, list[Measured]] = {}
-    for run in done:
-        groups.setdefault(run.measured.scene, []).append(run.measured)
+    runs = [each.measured for each in done]
+    groups = {name: [run for run in runs if run.scene == name] for name in dict.fromkeys(run.scene for run in runs)}
     notes += [
         f"Comparison within {name}: its scenes have different views, so their numbers do not compare."
         for name, group in groups.items()
@@ -122,15 +114,12 @@ def compare(
     print(markdown(groups, notes), end="")
     if out is not None:
         page = report_page(done, notes, command, "photo" if photos else scenes[0].name)
-        rows = [run.measured.as_json() for run in done]
+        rows = [run.as_json() for run in runs]
         files = {"json": json.dumps(rows, indent=1), "csv": csv_text(rows), "md": markdown(groups, notes), "html": page}
         write_files({out / f"report.{kind}": text.encode(errors="backslashreplace") for kind, text in files.items()})
         print(f"wrote {out / 'report.html'}, for a browser ({len(page) / 1e6:.1f} MB), report.md, .csv and .json")
-    low = [
-        run.measured.label
-        for run in done
-        if run.measured.full.views and min_psnr is not None and not (run.measured.full.mean("psnr") or 0) >= min_psnr
-    ]
+    least = -math.inf if min_psnr is None else min_psnr
+    low = [run.label for run in runs if run.full.views and not (run.full.mean("psnr") or 0) >= least]
     if low:
         print(f"below {min_psnr:g} dB: {', '.join(low)}", file=sys.stderr)
     return 1 if failures or low else 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes.util
-import importlib
 import importlib.util
 import os
 import platform
@@ -23,8 +22,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from sundae_ns.cli.options import Flag
-from sundae_ns.core.errors import BackendError
+from sundae_ns.core.errors import BackendError, SundaeError
 from sundae_ns.core.metrics import lpips_weights
+from sundae_ns.data.reconstruct import INSTALL, pycolmap
+from sundae_ns.rasterize import interface
 
 PACKAGES = ("sundae-ns", "nerfstudio", "gsplat", "torch", "torchvision", "numpy", "scipy", "tyro")
 
@@ -70,20 +71,19 @@ def parts(compile_kernels: bool = False) -> list[Part]:
         f"then export CUDA_HOME=/usr/local/cuda-{cuda} PATH=/usr/local/cuda-{cuda}/bin:$PATH"
     )
     fix_weights = f"curl --location --create-dirs --output {shlex.quote(str(weights))} {url}"
-    fix_photos, library = 'pip install "sundae_ns[photos]"', ctypes.util.find_library
     checks: list[tuple[str, Callable[[], str | None], str, str]] = [
         ("python", platform.python_version, "", ""),
         *((name, partial(metadata.version, name), f"pip install {name}", "") for name in PACKAGES),
         ("CUDA", _cuda, fix_cuda if cuda else "pip install torch==2.11.0", ""),
-        ("nvcc", _nvcc, fix_nvcc, ""),
+        ("nvcc", _nvcc, fix_nvcc, "the first build of gsplat's kernels"),
         ("gsplat kernels", partial(_gsplat, compile_kernels), "sundae doctor --compile, with CUDA and nvcc", ""),
         ("our kernels", _kernels, "update the driver; without them the CPU and PyTorch do their work", ""),
         ("rasteriser", _rasterizer, "pip install numba", ""),
         ("LPIPS weights", lambda: str(weights) if weights.is_file() else None, fix_weights, "LPIPS among the metrics"),
-        ("libusb-1.0", partial(library, "usb-1.0"), "apt-get install libusb-1.0-0", "ns-export"),
-        ("libGL", partial(library, "GL"), "apt-get install libgl1", "ns-export"),
-        ("pycolmap", partial(_module, "pycolmap"), fix_photos, "sundae poses"),
-        ("pillow-heif", partial(_module, "pillow_heif"), fix_photos, "HEIC photos"),
+        ("libusb-1.0", partial(ctypes.util.find_library, "usb-1.0"), "apt-get install libusb-1.0-0", "ns-export"),
+        ("libGL", partial(ctypes.util.find_library, "GL"), "apt-get install libgl1", "ns-export"),
+        ("pycolmap", lambda: pycolmap().__version__, INSTALL, "sundae poses"),
+        ("pillow-heif", partial(metadata.version, "pillow-heif"), INSTALL, "HEIC photos"),
         ("ffmpeg", partial(shutil.which, "ffmpeg"), "apt-get install ffmpeg", "ns-render"),
     ]
     return [_checked(*check) for check in checks]
@@ -96,17 +96,9 @@ def _checked(name: str, check: Callable[[], str | None], remedy: str, purpose: s
         works, text = bool(text), text or "not found"
     except metadata.PackageNotFoundError:
         works, text = False, "not installed"
-    except BackendError as error:
+    except SundaeError as error:
         works, text = False, str(error)
     return Part(name, works, f"{text}, for {purpose}" if purpose else text, remedy)
-
-
-def _module(name: str) -> str:
-    try:
-        return str(importlib.import_module(name).__version__)
-    except ImportError as error:
-        absent = isinstance(error, ModuleNotFoundError) and error.name == name
-        raise BackendError("not installed" if absent else f"cannot be loaded ({error})") from error
 
 
 def _cuda() -> str:
@@ -117,11 +109,11 @@ def _cuda() -> str:
 
 def _nvcc() -> str:
     """The compiler of gsplat's kernels: gsplat calls the one in PATH, torch the one in CUDA_HOME."""
-    purpose, in_path, built = "gsplat needs it once, to build its kernels", shutil.which("nvcc"), torch.version.cuda
+    in_path, built = shutil.which("nvcc"), torch.version.cuda
     home = os.environ.get("CUDA_HOME") or os.environ.get("CUDA_PATH")
     compiler = Path(home) / "bin" / "nvcc" if home else Path(in_path or "/usr/local/cuda/bin/nvcc")
     if not compiler.is_file() or not in_path:
-        raise BackendError(f"not found in {'PATH' if compiler.is_file() else compiler.parent}; {purpose}")
+        raise BackendError(f"not found in {'PATH' if compiler.is_file() else compiler.parent}")
     try:
         words = [str(compiler), "--version"]
         done = subprocess.run(words, capture_output=True, encoding="utf-8", errors="replace", check=True, timeout=60)
@@ -129,17 +121,15 @@ def _nvcc() -> str:
     except (OSError, subprocess.SubprocessError):
         release = ""
     if built and release.partition(".")[0] != built.partition(".")[0]:  # torch refuses one of another major version
-        raise BackendError(f"{compiler} has CUDA {release or 'of unknown version'}, this torch {built}; {purpose}")
-    return f"{compiler} {release}, for gsplat's kernels"
+        raise BackendError(f"{compiler} has CUDA {release or 'of unknown version'}, this torch {built}")
+    return f"{compiler} {release}"
 
 
 def _gsplat(compile_kernels: bool) -> str:
-    from sundae_ns.rasterize.interface import select_backend
-
     _cuda()
     if not compile_kernels and not kernels_built():
         raise BackendError("not built yet; the first training step builds them, in minutes")
-    select_backend("gsplat", "cuda")
+    interface.select_backend("gsplat", "cuda")
     return "working"
 
 
@@ -148,8 +138,7 @@ def kernels_built() -> bool:
     spec = importlib.util.find_spec("gsplat")
     if spec is None or spec.origin is None:
         return False
-    cache = os.environ.get("TORCH_EXTENSIONS_DIR")
-    root = Path(cache) if cache else Path(torch.hub.get_dir()).parent.parent / "torch_extensions"
+    root = Path(os.environ.get("TORCH_EXTENSIONS_DIR") or Path(torch.hub.get_dir()).parents[1] / "torch_extensions")
     return any(Path(spec.origin).parent.glob("csrc*")) or any(root.glob("**/gsplat_cuda.so"))
 
 
@@ -169,10 +158,8 @@ def _kernels() -> str:
 
 def _rasterizer() -> str:
     """The backend that ``auto`` selects."""
-    from sundae_ns.rasterize.interface import numba_problem
-
     if torch.cuda.is_available():
         return "auto selects gsplat, if its kernels work"
-    if (problem := numba_problem()) is not None:
+    if (problem := interface.numba_problem()) is not None:
         raise BackendError(f"auto selects reference, in plain PyTorch, several times slower than cpu: {problem}")
     return "auto selects cpu, compiled by numba; it suits small scenes, a capture needs CUDA"

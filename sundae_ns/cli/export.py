@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import tyro
 from rich.console import Console
 
-from sundae_ns.cli.inputs import copies_rows, name_of, opened, prepared_page, print_cost, reduced
-from sundae_ns.cli.options import Advanced, Flag, Maybe, Out, Plain, Scene, SceneDetails, Wishes, progress_bar
+from sundae_ns.cli.inputs import opened
+from sundae_ns.cli.options import Advanced, File, Flag, Out, Plain, Scene, SceneDetails, Wishes, progress_bar
 from sundae_ns.cli.refusals import check_file, check_folder, check_suffix
 from sundae_ns.core.errors import ConfigError
 from sundae_ns.core.gaussians import sh_degree
@@ -33,7 +32,7 @@ class ExportDetails(SceneDetails):
 def export(
     scene: Scene,
     out: Out,
-    beside: tyro.conf.Positional[Maybe[Path]] = None,
+    beside: tyro.conf.Positional[File] = None,
     wishes: Plain[Wishes] = Wishes(),  # noqa: B008
     views: tuple[str, ...] = (),
     lod: Flag = False,
@@ -54,40 +53,39 @@ def export(
             images; minutes on a GPU.
     """
     wishes.check_wishes()
-    if lod and out.suffix:
+    suffix, upright = out.suffix.lower(), advanced.upright
+    page = suffix in (".html", "") and not lod
+    if lod and suffix:
         raise ConfigError(f"{out} is no folder, which levels of detail take; name one without a suffix")
-    page, upright = out.suffix.lower() in (".html", "") and not lod, advanced.upright
-    if out.suffix and not page:
+    if suffix:
         check_suffix(out, (*FORMATS, ".html"))
     reads = [*files_of(scene), beside, advanced.data, advanced.cameras]
-    (check_file if out.suffix else check_folder)(out, reads=reads, overwrite=advanced.overwrite)
-    if page:
-        if upright:
-            raise ConfigError("a page turns the scene upright by itself; leave out --upright")
-        before = opened(scene, wishes, advanced, capture=True)
-        first = name_of(scene), *prepared_page(scene, wishes, advanced, before)
-        second = () if beside is None else ((name_of(beside), *prepared_page(beside, Wishes(), SceneDetails())),)
-        named = {name: link for name, _, link in (word.partition("=") for word in views)}
-        size = write_page(out, first, *second, views=named)
-        print(f"{out}: {size:,} bytes; {'open it in a browser' if out.suffix else 'serve it'}")
-        if kind_of(scene) != "packed" or first[1] is not before.scene:
-            print_cost(out if out.suffix else out / "scene.sundae", before, scene, wishes, advanced)
-        return 0
-    if beside is not None or views:
+    (check_file if suffix else check_folder)(out, reads=reads, overwrite=advanced.overwrite)
+    if page and upright:
+        raise ConfigError("a page turns the scene upright by itself; leave out --upright")
+    if not page and (beside is not None or views):
         raise ConfigError("only a page shows two scenes or named views; name it .html, or without a suffix")
-    copies = copies_rows(scene, out)
-    if copies and (upright or not (wishes.cleans or wishes.reduces)):
+    if not page and (advanced.start_view, advanced.up) != (None, None):
+        raise ConfigError(f"{suffix or '.sog'} files hold neither a start view nor an up axis; leave them out")
+    before, changes, costs = opened(scene, wishes, advanced, capture=page or lod), wishes.cleans or wishes.reduces, True
+    copies, file = before.copies_rows(out), out
+    if copies and (upright or not changes):
         raise ConfigError(f"{scene} is a .ply already; give an output name that ends in .spz or .sog")
-    if advanced.start_view is not None or advanced.up is not None:
-        raise ConfigError(f"{out.suffix or '.sog'} files hold neither a start view nor an up axis; leave them out")
-    before = opened(scene, wishes, advanced, capture=lod)
-    left = reduced(before, scene, wishes, advanced, out=out)
+    left = before if page else before.reduced(out)
     if upright and not left.scene.in_model_frame:
         raise ConfigError(f"{scene} is not in nerfstudio's coordinates, which --upright turns; leave it out")
-    if lod:
+    if page:
+        shown = [before.shown()]
+        if beside is not None:
+            shown.append(opened(beside, Wishes(), SceneDetails(), capture=True).shown())
+        named = {name: link for name, _, link in (word.partition("=") for word in views)}
+        size, file = write_page(out, *shown, views=named), out if suffix else out / "scene.sundae"
+        print(f"{out}: {size:,} bytes; {'open it in a browser' if suffix else 'serve it'}")
+        costs = kind_of(scene) != "packed" or shown[0][1] is not before.scene
+    elif lod:
         from sundae_ns.plugin.distill import levels_of  # imports nerfstudio, which takes seconds
 
-        levels = [left.scene.to(fastest_device())]
+        levels, file = [left.scene.to(fastest_device())], out / STREAMED
         with progress_bar() as bar:
             task = bar.add_task("Levels of detail", total=None)
             trained = levels_of(levels[0], left.scene.cameras, lambda i, n: bar.update(task, completed=i, total=n))
@@ -95,23 +93,21 @@ def export(
                 print(f"{level.num_gaussians:,} Gaussians: {psnr:.2f} dB against the full scene, on cameras of no step")
                 levels.append(level)
         save_levels(levels, out, upright=upright)
-        print(f"{out / STREAMED}: {levels[0].num_gaussians:,} Gaussians and {len(levels) - 1} levels below")
-        print_cost(out / STREAMED, before, scene, wishes, advanced, upright=upright)
-        return 0
-    if copies:
-        left.write(scene, out)
-        print(f"{out}: {left.scene.num_gaussians:,} of {left.total:,} Gaussians")
-        print_cost(out, before, scene, wishes, advanced)
-        return 0
-    with Console(stderr=True).status(f"Writing {left.scene.num_gaussians:,} Gaussians"):  # a .sog takes minutes
-        written = save_for_viewers(left.stated, out, upright=upright)
-    mode, degree = ", antialiased" if left.scene.antialiased else "", sh_degree(written["features_rest"])
-    print(f"{out}: {len(written['means']):,} Gaussians, degree {degree}{mode}, {out.stat().st_size:,} bytes")
-    if out.suffix.lower() == ".spz" and (beyond := clamped(written)):
-        print(f"clamped scales or colours of {beyond:,} Gaussians to the range of a .spz; a .sog has none")
-    if degree < left.stated.gaussians.sh_degree:
-        print(f"left out harmonics above SH degree {degree}, which {out.suffix} cannot store; .ply can")
-    exact = out.suffix.lower() in (".ply", ".glb") and degree == before.scene.gaussians.sh_degree
-    if not exact or before.scene.head is not None or wishes.cleans or wishes.reduces:
-        print_cost(out, before, scene, wishes, advanced, upright=upright)
+        print(f"{file}: {levels[0].num_gaussians:,} Gaussians and {len(levels) - 1} levels below")
+    elif copies:
+        left.write(out)
+        print(f"{out}: {left.scene.num_gaussians:,} of {len(left.rows):,} Gaussians")
+    else:
+        with Console(stderr=True).status(f"Writing {left.scene.num_gaussians:,} Gaussians"):  # a .sog takes minutes
+            written = save_for_viewers(left.stated, out, upright=upright)
+        mode, degree = ", antialiased" if left.scene.antialiased else "", sh_degree(written["features_rest"])
+        print(f"{out}: {len(written['means']):,} Gaussians, degree {degree}{mode}, {out.stat().st_size:,} bytes")
+        if suffix == ".spz" and (beyond := clamped(written)):
+            print(f"clamped scales or colours of {beyond:,} Gaussians to the range of a .spz; a .sog has none")
+        if degree < left.stated.gaussians.sh_degree:
+            print(f"left out harmonics above SH degree {degree}, which {suffix} cannot store; .ply can")
+        exact = suffix in (".ply", ".glb") and degree == before.scene.gaussians.sh_degree
+        costs = not exact or before.scene.head is not None or bool(changes)
+    if costs:
+        before.print_cost(file, upright=upright)
     return 0

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from json import dumps
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
 from sundae_ns.cli.inputs import chosen_cameras
-from sundae_ns.cli.options import Flag, Maybe, Scene
+from sundae_ns.cli.options import File, Flag, Scene
 from sundae_ns.core.tables import without_nan
 from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.scene.describe import describe
 from sundae_ns.scene.load_save import load
 
 
-def info(scene: Scene, cameras: Maybe[Path] = None, json: Flag = False) -> int:
+def info(scene: Scene, cameras: File = None, json: Flag = False) -> int:
     """Say what a scene holds: Gaussians, bounds, marks, bytes, what cameras do not see, likely floaters, a crop box.
 
     Args:

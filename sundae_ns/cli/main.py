@@ -39,12 +39,14 @@ COMMANDS = {
     "doctor": "check this machine, and say how to repair it",
 }
 """Commands with their lines in ``sundae --help``. Each is the function of its name in the module of its name."""
+typed: list[str] = []  # words of the command, as it records them
 STEP = "SUNDAE_STEP"  # variable of a command that another one started, which tells how to continue
 
 
 def _dispatch(words: Sequence[str]) -> int:
     """Run the command that the words name; its exit code."""
     name, *options = words or ["help"]
+    typed[:] = words
     if name in ("--version", "-V", "version"):
         print(f"sundae_ns {sys.modules['sundae_ns'].__version__}")
         return 0
@@ -65,8 +67,7 @@ def _dispatch(words: Sequence[str]) -> int:
         options[at:at] = [] if "".join(options[at : at + 1]).replace(".", "", 1).isdigit() else ["0.25"]
     # Only the module of this command: some import torch, which takes a second.
     run = getattr(importlib.import_module(f"sundae_ns.cli.{name}"), name)
-    short = importlib.import_module("sundae_ns.cli.options").SHORT
-    return tyro.cli(run, prog=f"sundae {name}", args=options, registry=short)
+    return tyro.cli(run, prog=f"sundae {name}", args=options)
 
 
 def exit_with(command: Callable[[], int], name: str) -> NoReturn:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
@@ -10,27 +9,32 @@ from dataclasses import dataclass, replace
 from functools import cache
 from io import StringIO
 from json import dumps
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import torch
-import tyro
-
-from sundae_ns.cli.inputs import Left, chosen_cameras, open_run, print_cost, reduced
-from sundae_ns.cli.options import Advanced, Flag, Maybe, Out, Plain, SceneDetails, Wishes, progress_bar
-from sundae_ns.cli.refusals import check_drop, check_exclusive, check_file, check_least
+from sundae_ns.cli.inputs import opened
+from sundae_ns.cli.options import (
+    Advanced,
+    Flag,
+    Float,
+    Out,
+    Plain,
+    SceneDetails,
+    Source,
+    Wishes,
+    progress_bar,
+    words_of,
+)
+from sundae_ns.cli.refusals import check_exclusive, check_file, check_least
 from sundae_ns.core.errors import ConfigError, SundaeError
-from sundae_ns.core.tables import MEGABYTE
+from sundae_ns.core.tables import MEGABYTE, without_nan
+from sundae_ns.io.config_file import check_run
 from sundae_ns.io.formats import PRIMITIVES, kind_of_gaussians
-from sundae_ns.io.pack.config import FINETUNE_STEPS, FINETUNED, FINETUNED_SIZE, PackConfig
-from sundae_ns.io.pack.packed_scene import fit_scene, pack_bytes, write_fitted
+from sundae_ns.io.pack.config import FINETUNED, FINETUNED_SIZE, PackConfig
+from sundae_ns.io.pack.packed_scene import Codecs, PackedScene, fit_scene, pack_bytes, write_fitted
 from sundae_ns.io.run_folder import files_of
-from sundae_ns.scene.cameras import with_start
-from sundae_ns.scene.load_save import load
 from sundae_ns.scene.packing import contents_of
 
 if TYPE_CHECKING:
-    from sundae_ns.io.pack.packed_scene import Codecs, PackedScene
     from sundae_ns.plugin.tuned_packs import Judge
 
 
@@ -38,7 +42,7 @@ if TYPE_CHECKING:
 class PackDetails(SceneDetails):
     """Options that few need."""
 
-    target_drop: Maybe[float] = None
+    target_drop: Float = None
     """find the coarsest steps that lose at most this PSNR on some test views, dB."""
     finetune: int = 0
     """training steps with quantisation in the loop before packing, for example 1000, for a smaller file; the run is not
@@ -50,7 +54,7 @@ class PackDetails(SceneDetails):
 
 
 def pack(
-    run: Annotated[Path, tyro.conf.Positional],
+    run: Source,
     out: Out,
     wishes: Plain[Wishes] = Wishes(),  # noqa: B008
     advanced: Advanced[PackDetails] = PackDetails(),  # noqa: B008
@@ -62,75 +66,62 @@ def pack(
             .ksplat or gsplat's .pt.
         out: file to write, for example scene.sundae.
     """
-    finetune, target_drop, data = advanced.finetune, advanced.target_drop, advanced.data
+    finetune, target_drop, max_mb = advanced.finetune, advanced.target_drop, wishes.max_mb
     wishes.check_wishes()
-    check_exclusive(max_mb=wishes.max_mb, target_drop=target_drop)
-    check_least(max_cameras=(advanced.max_cameras, 0), finetune=(finetune, 0))
-    check_drop(target_drop)
+    check_exclusive(max_mb=max_mb, target_drop=target_drop)
+    check_least(max_cameras=(advanced.max_cameras, 0), finetune=(finetune, 0), target_drop=(target_drop, 0.001))
     if wishes.cleans and (finetune or target_drop is not None):
-        whole = "--finetune and --target-drop look at photos of the whole scene"
-        raise ConfigError(f"{whole}; leave out {wishes.cleans}, or cut the scene by `sundae prune` afterwards")
-    check_file(out, reads=[*files_of(run), data, advanced.cameras], overwrite=advanced.overwrite)
+        raise ConfigError(f"--finetune and --target-drop need the whole scene; leave out {wishes.cleans[0]}, or them")
+    check_file(out, reads=[*files_of(run), advanced.data, advanced.cameras], overwrite=advanced.overwrite)
     kind = kind_of_gaussians(run)
-    for name, value in (("--finetune", finetune), ("--target-drop", target_drop), ("--data", data)):
-        if kind is not None and value:
-            raise ConfigError(f"{run} is a {PRIMITIVES[kind]} without photos; leave out {name}, or give a run")
-    tuned, packs = finetune > 0, list[tuple["PackedScene", "Codecs"]]()
-
-    @cache
-    def judge() -> Judge:
-        from sundae_ns.plugin.tuned_packs import Judge
-
-        return Judge(run, data)
-
-    scene = open_run(run, max_cameras=advanced.max_cameras, data=data) if kind is None else load(run)
-    scene = with_start(scene, advanced.start_view, advanced.up)
-    before = Left(scene, None, len(scene), cameras=chosen_cameras(scene, advanced.cameras, None))
+    if kind is None:
+        check_run(run)
+    elif of_photos := words_of(advanced, "finetune", "target_drop", "data"):
+        raise ConfigError(f"{run} is a {PRIMITIVES[kind]} without photos; leave out {of_photos[0]}, or give a run")
+    before = opened(run, wishes, advanced, capture=True, most=advanced.max_cameras)
     # A fine-tune shrinks the file, and the search below rounds it to its size.
-    max_mb = None if wishes.max_mb is None else wishes.max_mb / (FINETUNED_SIZE if tuned else 1)
-    like = out.with_suffix(".sundae")
-    left = reduced(before, run, replace(wishes, max_mb=max_mb), advanced, out=like, rounds=not tuned)
-    most = None if wishes.max_mb is None else int(wishes.max_mb * MEGABYTE)
-    source = contents_of(left.stated)
+    larger = None if max_mb is None else max_mb / (FINETUNED_SIZE if finetune else 1)
+    asked = before._replace(wishes=replace(wishes, max_mb=larger))
+    left = asked.reduced(out.with_suffix(".sundae"), rounds=not finetune)
+    source, packs = contents_of(left.stated), list[tuple[PackedScene, Codecs]]()
+    figures: dict[str, Any] = {}
     with progress_bar() as bar, redirect_stdout(StringIO()):  # nerfstudio's messages
         task = bar.add_task("Fine-tuning" if finetune else "Packing", total=2 + finetune)
-        if finetune:
+        if kind is None:
+            from sundae_ns.plugin.tuned_packs import Judge, Search, best_pack
             from sundae_ns.plugin.tuned_packs import finetune as tune
 
-            packs.append(tune(run, source, FINETUNED, finetune, data=data, progress=lambda _: bar.advance(task)))
+            judge, progress = cache(lambda: Judge(run, advanced.data)), lambda _: bar.advance(task)
+        if finetune:
+            packs.append(tune(run, source, FINETUNED, finetune, data=advanced.data, progress=progress))
         bar.update(task, description="Packing")
-        if (tuned and most is not None) or target_drop is not None:
-            from sundae_ns.plugin.tuned_packs import Search, best_pack
-
+        if (finetune and max_mb is not None) or target_drop is not None:
             # Starts from the source, because positions of a fitted pack are rounded.
             searches = [Search(source, PackConfig(), judge), *(Search(*each, judge) for each in packs)]
+            most = None if max_mb is None else int(max_mb * MEGABYTE)
             best = best_pack(searches, most_bytes=most, most_drop=target_drop or 0.0)
             if packs and best.scene is not packs[0][0]:
                 print("the fine-tune loses too much for the target; packed without it, try more steps", file=sys.stderr)
-                finetune = 0
             packs = [(best.scene, best.codecs)]  # both are compared already
         else:
             packs.append(fit_scene(source, left.precision))
         report = write_fitted(out, *packs[0])
         bar.update(task, advance=1, description="Measuring")
-        # Photos show what a box leaves out.
-        figures = _measured(judge, packs, finetune) if kind is None and wishes.crop is None else {}
+        if kind is None and wishes.crop is None:  # photos show what a box leaves out
+            figures = _measured(judge, packs, finetune)
     if advanced.json:
-        print(dumps({"file": str(out), **report.summary(), **figures}))
+        print(dumps(without_nan({"file": str(out), **report.summary(), **figures})))
         return 0
     print(f"{out}: {report.primitives:,} Gaussians in {report.bytes:,} bytes ({report.bytes / 1e6:.2f} MB)")
     print(f"{'':14}{'bytes':>12}{'bits per Gaussian':>20}")
     for name, bits in {**report.bits, "all": 8 * report.bytes / report.primitives}.items():
         print(f"{name:14}{round(bits * report.primitives / 8):12,}{bits:20.2f}")
-    if figures:
-        psnr, ssim = figures["psnr"], figures.get("ssim")
-        shown = "" if ssim is None else f", SSIM {ssim[0]:.4f} -> {ssim[1]:.4f}"
-        views = f"{figures['views']} of {figures['test_views']} test views"
-        print(f"PSNR {psnr[0]:.2f} -> {psnr[1]:.2f} dB{shown}, before and after, on {views}")
-        if not tuned and not wishes.cleans and torch.cuda.is_available():
-            print(f"--finetune {FINETUNE_STEPS} makes it about 40% smaller")
-    else:
-        print_cost(out, before, run, wishes, advanced)
+    if not figures:
+        before.print_cost(out)
+        return 0
+    (psnr, packed), (ssim, packed_ssim) = figures["psnr"], figures["ssim"]
+    shown = f"PSNR {psnr:.2f} -> {packed:.2f} dB, SSIM {ssim:.4f} -> {packed_ssim:.4f}, before and after"
+    print(f"{shown}, on {figures['views']} of {figures['test_views']} test views")
     return 0
 
 
@@ -140,19 +131,15 @@ def _measured(judge: Callable[[], Judge], packs: Sequence[tuple[PackedScene, Cod
 
     try:
         views = judge()
-        before, after = views.before, views.quality(*packs[0])
+        before, (after, *others) = views.before, [views.quality(*pack) for pack in packs]
     except SundaeError as error:
         print(f"the quality is not measured: {error}", file=sys.stderr)
         return {}
-    figures: dict[str, Any] = {"psnr": [before.psnr, after.psnr]}
-    if math.isfinite(before.ssim + after.ssim):  # not for images smaller than its window
-        figures["ssim"] = [before.ssim, after.ssim]
-    for plain in packs[1:]:
-        without = views.quality(*plain).psnr
-        size, plain_size = (len(pack_bytes(*pack)[0]) for pack in (packs[0], plain))
-        if not is_worth(after.psnr, size, without, plain_size):
-            lost, plain_lost = before.psnr - after.psnr, before.psnr - without
-            other = f"a pack without it has {plain_size:,} bytes and loses {plain_lost:.2f} dB, which is worth more"
-            remedy = "give more steps, or leave out --finetune"
-            print(f"the fine-tune of {finetune:,} steps loses {lost:.2f} dB; {other}: {remedy}", file=sys.stderr)
+    size, *sizes = (len(pack_bytes(*pack)[0]) for pack in packs)
+    for other, plain in zip(others, sizes, strict=True):
+        if not is_worth(after.psnr, size, other.psnr, plain):
+            lost = f"the fine-tune of {finetune:,} steps loses {before.psnr - after.psnr:.2f} dB"
+            other_lost = f"a pack without it has {plain:,} bytes and loses {before.psnr - other.psnr:.2f} dB"
+            print(f"{lost}; {other_lost}: give more steps, or leave out --finetune", file=sys.stderr)
+    figures = {"psnr": [before.psnr, after.psnr], "ssim": [before.ssim, after.ssim]}
     return {**figures, "views": views.cameras, "test_views": views.all_cameras}

@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from sundae_ns.cli.main import STEP
-from sundae_ns.cli.options import Maybe, Out, Plain, Source, progress_bar
-from sundae_ns.cli.process import quoted, word
+from sundae_ns.cli.options import File, Out, Plain, Source, progress_bar, word
 from sundae_ns.cli.refusals import check_folder, check_least
 from sundae_ns.core.errors import ConfigError, DataError, SundaeError, one_line
-
-if TYPE_CHECKING:
-    from sundae_ns.data.capture_files import Placed
-
+from sundae_ns.data.capture_files import Placed
 
 _warn = partial(print, "# warning:", flush=True)
 
@@ -34,22 +31,12 @@ class PoseOptions:
     """photos that are compared: all pairs, neighbours in time and similar ones (for a video), or similar ones; by
     default what suits their number."""
     frames: int = 150  # number of frames of a video; the sharpest of each stretch
-    masks: Maybe[Path] = None
+    masks: File = None
     """folder with a mask for each photo, under its name; training leaves out what is black. By default one named masks
     beside the photos."""
 
-    def words(self) -> list[str]:
-        """Words of the command for options that differ from their defaults."""
-        usual = PoseOptions()
-        given = {name: value for name, value in vars(self).items() if value != getattr(usual, name)}
-        return [text for name, value in given.items() for text in (f"--{name}", word(Path(str(value))))]
 
-
-def poses(
-    photos: Source,
-    out: Out,
-    options: Plain[PoseOptions] = PoseOptions(),  # noqa: B008
-) -> int:
+def poses(photos: Source, out: Out, options: Plain[PoseOptions] = PoseOptions()) -> int:  # noqa: B008
     """Find the camera poses of photos, and write a capture: images at several sizes, transforms.json, points, masks.
 
     The same command again continues an interrupted one. All processors are used, or as many as OMP_NUM_THREADS says.
@@ -84,32 +71,28 @@ def check_poses(photos: Path, options: PoseOptions, *, remarks: bool = True) -> 
     from sundae_ns.data.reconstruct import check_installed
     from sundae_ns.data.video import SUFFIXES, check_video, is_video
 
-    masks = options.masks
     check_installed()
-    if not photos.exists():
-        raise DataError(f"{photos} does not exist; give a folder of photos, or a video")
     check_least(frames=(options.frames, LEAST_PHOTOS))
-    if masks is not None and not masks.is_dir():
-        raise DataError(f"{masks} is no folder of masks; give one with an image for each photo")
     if is_video(photos):
-        if masks is not None:
+        if options.masks is not None:
             raise ConfigError("a video has no masks; leave out --masks")
         check_video(photos)
         return None
-    if photos.is_file():
+    if not photos.is_dir():
         raise DataError(f"{photos} is neither a folder of photos nor a video ({', '.join(SUFFIXES)})")
     warn: Callable[[str], object] = _warn if remarks else str
     files = find_photos(photos, warn)
-    if masks is not None:
-        masks_of(files, masks)
     if (remark := left_out(photos)) is not None:
         warn(remark)
-    if masks is None and (beside := masks_beside(photos)) is not None:
-        try:
-            masks_of(files, beside)
-            masks = beside
-        except DataError as error:
-            warn(f"{beside} is left out: {error}")
+    masks = options.masks or masks_beside(photos)
+    try:
+        if masks is not None:
+            masks_of(files, masks)
+    except DataError as error:
+        if options.masks is not None:
+            raise
+        warn(f"{masks} is left out: {error}")
+        return None
     return masks
 
 
@@ -126,19 +109,15 @@ def _report(stage: str, total: int) -> Iterator[Callable[[int], None]]:
 def _interruptible(work: Callable[[], Placed], folder: Path) -> Placed:
     """Run in a thread: COLMAP's functions return to Python only after minutes, and an interrupt ends them at once."""
     with ThreadPoolExecutor(1) as threads:
-        future = threads.submit(work)
         try:
-            while not future.done():
-                wait([future], 0.2)
+            return threads.submit(work).result()
+        except (SundaeError, OSError):
+            raise
         except KeyboardInterrupt:
             cursor = "\x1b[?25h\x1b[2K\r" if sys.stderr.isatty() else ""  # a bar hides it
             said = "" if os.environ.get(STEP) else "sundae: interrupted; the same command continues here\n"
             print(f"{cursor}{said}", end="", file=sys.stderr, flush=True)
             os._exit(130)
-    try:
-        return future.result()
-    except (SundaeError, OSError):
-        raise
-    except BaseException as error:
-        remedy = f"remove {quoted(folder)} and start again, or report it"
-        raise DataError(f"COLMAP failed ({one_line(error)}); {remedy}") from error
+        except BaseException as error:
+            remedy = f"remove {shlex.quote(word(folder))} and start again, or report it"
+            raise DataError(f"COLMAP failed ({one_line(error)}); {remedy}") from error

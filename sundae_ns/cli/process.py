@@ -28,16 +28,6 @@ _MESSAGES = re.compile(
 """Messages of ns-train by this package, and its table of the schedule. Those of nerfstudio end in a line of code."""
 
 
-def word(path: Path) -> str:
-    """A path as a word of a command; one that begins with a dash would be taken for an option."""
-    return f".{os.sep}{path}" if str(path).startswith("-") else str(path)
-
-
-def quoted(path: Path) -> str:
-    """A path as a word of a command that a user copies into a shell."""
-    return shlex.quote(word(path))
-
-
 def run_command(words: Sequence[str], log: Path | None = None) -> int:
     """Print a command and run it; its exit code. ``log`` takes what ns-train prints, except a bar and messages."""
     print(shlex.join(words), flush=True)
@@ -71,10 +61,9 @@ def run_logged(
     """
     # Programs beside this interpreter come first.
     program = shutil.which(words[0], path=str(Path(sys.executable).parent)) or words[0]
-    environment = {**os.environ, STEP: "1", "PYTHONWARNINGS": "ignore"}
+    environment = {**os.environ, STEP: "1", "PYTHONWARNINGS": "ignore", **({"COLUMNS": "160"} if log else {})}
     options: dict[str, Any] = {"stdin": subprocess.DEVNULL, "start_new_session": True, "env": environment}
     if log is not None:
-        environment |= {"COLUMNS": "160"}
         options |= {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "encoding": "utf-8", "errors": "replace"}
     if sys.platform == "linux":
         prctl = ctypes.CDLL(None).prctl
@@ -91,10 +80,8 @@ def run_logged(
         try:
             process = subprocess.Popen([program, *words[1:]], **options)
         except OSError as error:
-            cause = f"{words[0]} cannot be started ({error.strerror})"
-            raise SundaeError(f"{cause}; sundae doctor checks the setup") from error
-        heard = [number for number in _SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
-        before = {number: signal.signal(number, pass_on) for number in heard}
+            raise SundaeError(f"{words[0]} cannot be started ({error.strerror}); run sundae doctor") from error
+        before = {each: signal.signal(each, pass_on) for each in _SIGNALS if signal.getsignal(each) != signal.SIG_IGN}
         try:
             for line in process.stdout or ():
                 file.write(line)

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import dataclasses
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import tyro
 
-from sundae_ns.cli.inputs import Left, opened, print_cost, reduced, warn_if_few
-from sundae_ns.cli.options import Advanced, Flag, Maybe, Out, Plain, Scene, SceneDetails, Wishes, progress_bar
-from sundae_ns.cli.refusals import check_drop, check_exclusive, check_file, check_suffix
+from sundae_ns.cli.inputs import Edit, opened
+from sundae_ns.cli.options import Advanced, Flag, Float, Int, Out, Plain, Scene, SceneDetails, Wishes, progress_bar
+from sundae_ns.cli.refusals import check_exclusive, check_file, check_least, check_suffix
 from sundae_ns.core.errors import ConfigError
 from sundae_ns.pruning.rule import PruneRule, ScoreName
 from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.scene.load_save import SUFFIXES, save
-from sundae_ns.scene.virtual_cameras import virtual_cameras
 
 
 @dataclass
@@ -34,18 +32,18 @@ class RuleOptions(PruneRule):
 class PruneDetails(SceneDetails):
     """Options that few need."""
 
-    num_cameras: Maybe[int] = None
+    num_cameras: Int = None
     """number of virtual cameras, for scenes that come without cameras; by default 128, on a GPU 256."""
-    steps: Maybe[int] = None
+    steps: Int = None
     """number of training steps of --distill; by default 8,000 on a GPU, 3,000 on a CPU."""
-    rule: Plain[RuleOptions] = dataclasses.field(default_factory=RuleOptions)
+    rule: Plain[RuleOptions] = field(default_factory=RuleOptions)
 
 
 def prune(
     source: Scene,
     out: Out,
     wishes: Plain[Wishes] = Wishes(),  # noqa: B008
-    target_drop: Maybe[float] = None,
+    target_drop: Float = None,
     distill: Flag = False,
     advanced: Advanced[PruneDetails] = PruneDetails(),  # noqa: B008
 ) -> int:
@@ -64,7 +62,7 @@ def prune(
             resumes.
     """
     wishes.check_wishes(target_drop=target_drop)
-    check_drop(target_drop)
+    check_least(target_drop=(target_drop, 0.001))
     check_exclusive(distill=distill or None, max_mb=wishes.max_mb, target_drop=target_drop)
     with_head = check_suffix(out, SUFFIXES) in (".sundae", ".html")
     if advanced.steps is not None and not distill:
@@ -74,48 +72,42 @@ def prune(
     if advanced.start_view is not None and not with_head:
         raise ConfigError(f"{out.suffix} files hold no start view; leave it out, or name a .sundae or .html")
     if not wishes.reduces and target_drop is None:
-        wishes = dataclasses.replace(wishes, keep=0.1)
+        wishes = replace(wishes, keep=0.1)
     check_file(out, reads=[source, advanced.cameras], overwrite=advanced.overwrite)
     advanced.rule.validate()
-    before = opened(source, wishes, advanced, num_cameras=advanced.num_cameras)
+    before = opened(source, wishes, advanced)
     if distill:
-        whole = dataclasses.replace(wishes, keep=None, count=None)
-        code = _distilled(reduced(before, source, whole, advanced, out=out), out, wishes, advanced)
-        if code == 0:
-            print_cost(out, before, source, wishes, advanced)
-        return code
-    more: dict[str, Any] = {"rule": advanced.rule, "num_cameras": advanced.num_cameras, "target_drop": target_drop}
-    left = reduced(before, source, wishes, advanced, out=out, **more)
-    left.write(source, out)
-    print(f"{out}: {left.scene.num_gaussians:,} of {left.total:,} Gaussians")
-    if left.pruned is not None and left.pruned.seen is not None:
-        print(f"{len(left.cameras)} cameras see {left.pruned.seen:.1%} of the Gaussians")
-    print_cost(out, before, source, wishes, advanced)
+        if code := _distilled(before.cleaned(), out, advanced.steps):
+            return code
+    else:
+        left = before.reduced(out, rule=advanced.rule, num_cameras=advanced.num_cameras, target_drop=target_drop)
+        left.write(out)
+        print(f"{out}: {left.scene.num_gaussians:,} of {len(left.rows):,} Gaussians")
+        if left.pruned is not None and left.pruned.seen is not None:
+            print(f"{len(left.cameras)} cameras see {left.pruned.seen:.1%} of the Gaussians")
+    before.print_cost(out)
     return 0
 
 
-def _distilled(left: Left, out: Path, wishes: Wishes, details: PruneDetails) -> int:
+def _distilled(edit: Edit, out: Path, steps: int | None) -> int:
     """Train a smaller scene on images of the full one, and save it; its exit code."""
     from sundae_ns.plugin.distill import Distillation  # imports nerfstudio, which takes seconds
     from sundae_ns.train.progress import Interruption
 
-    warn_if_few(wishes.count, left.scene.num_gaussians)
-    scene, near = left.scene.to(fastest_device()), None
-    if details.cameras is not None:
-        near = left.cameras or virtual_cameras(scene, seed=details.seed or 0)
-    options: dict[str, Any] = {"keep": wishes.keep, "count": wishes.count, "cameras": near, "steps": details.steps}
+    wishes, details, scene = edit.wishes, edit.details, edit.scene.to(fastest_device())
+    near = None if details.cameras is None else edit.cameras
+    options: dict[str, Any] = {"keep": wishes.keep, "count": wishes.count, "cameras": near, "steps": steps}
     options |= {"seed": details.seed or 0, "head": not details.no_head, "progress": True}
     training, partial = Distillation(scene, **options), out.with_name(f"{out.name}.partial")
     if partial.exists():
         training.load(partial)
         print(f"resuming after step {training.step:,} of {training.steps:,}, with {partial}", file=sys.stderr)
-    stopped: list[bool] = []
-    with Interruption(lambda: stopped.append(True)), progress_bar() as bar:
+    with Interruption(lambda: None) as interruption, progress_bar() as bar:
         task = bar.add_task("Training", total=None)
 
         def after_step(done: int, total: int) -> bool:
             bar.update(task, completed=done, total=total)
-            return not stopped
+            return interruption.number == 0
 
         finished = training.train(after_step)
     if not finished:
@@ -128,8 +120,7 @@ def _distilled(left: Left, out: Path, wishes: Wishes, details: PruneDetails) -> 
     result = training.result()
     save(result, out)
     partial.unlink(missing_ok=True)
-    counts = f"{result.num_gaussians:,} of {scene.num_gaussians:,} Gaussians"
-    print(f"{out}: {counts}, {'with' if result.head else 'without'} a head")
+    print(f"{out}: {len(result):,} of {len(scene):,} Gaussians, {'with' if result.head else 'without'} a head")
     if training.gain is not None:
         print(f"a head gained {training.gain:.2f} dB in its trial, on cameras that no step sees")
     return 0

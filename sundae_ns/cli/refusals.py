@@ -72,12 +72,6 @@ def check_least(**values: tuple[float | None, float]) -> None:
             raise ConfigError(f"{name.replace('_', '-')} is {value}; give at least {least}")
 
 
-def check_drop(decibels: float | None) -> None:
-    """Raise ``ConfigError`` for a loss of PSNR that is no positive number of dB."""
-    if decibels is not None and not 0 < decibels < 100:
-        raise ConfigError(f"target-drop is {decibels}; give a positive number of dB, 0.5 for half a decibel")
-
-
 def check_exclusive(**values: object) -> None:
     """Raise ``ConfigError`` if more than one of the options is given."""
     given = [f"--{name.replace('_', '-')}" for name, value in values.items() if value is not None]

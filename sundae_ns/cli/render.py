@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from PIL import Image
 from rich.console import Console
 
-from sundae_ns.cli.inputs import opened, reduced
-from sundae_ns.cli.options import Advanced, Maybe, Out, Plain, Scene, SceneDetails, Wishes, progress_bar
+from sundae_ns.cli.inputs import opened
+from sundae_ns.cli.options import Advanced, File, Float, Int, Out, Plain, Scene, SceneDetails, Wishes, progress_bar
 from sundae_ns.cli.refusals import check_file, check_least, check_suffix
-from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import ConfigError
 from sundae_ns.core.files import replacing, write_image, write_video
 from sundae_ns.rasterize.interface import fastest_device
-from sundae_ns.scene.cameras import CameraFile, camera_in_front, film_views, read_cameras
+from sundae_ns.scene.cameras import camera_in_front, film_views, read_cameras
 from sundae_ns.scene.scene import image_of
 from sundae_ns.scene.scene import render as render_view
 
@@ -25,11 +23,11 @@ SECONDS = 12.0
 def render(
     scene: Scene,
     out: Out,
-    camera: Maybe[Path] = None,
-    view: Maybe[int] = None,
-    width: Maybe[int] = None,
-    seconds: Maybe[float] = None,
-    fps: Maybe[float] = None,
+    camera: File = None,
+    view: Int = None,
+    width: Int = None,
+    seconds: Float = None,
+    fps: Float = None,
     wishes: Plain[Wishes] = Wishes(),  # noqa: B008
     advanced: Advanced[SceneDetails] = SceneDetails(),  # noqa: B008
 ) -> int:
@@ -54,38 +52,29 @@ def render(
         raise ConfigError("--fps is of a video, from above 0 to 240; leave it out, or name a video .mp4")
     wishes.check_wishes()
     check_file(out, reads=[scene, camera, advanced.cameras], overwrite=advanced.overwrite)
-    shown = reduced(opened(scene, wishes, advanced), scene, wishes, advanced, out=Path("scene.sundae")).stated
+    shown = opened(scene, wishes, advanced).reduced(Path("scene.sundae")).stated
+    views, speed = list(shown.cameras) or [camera_in_front(shown)], None
     if camera is not None:
-        cameras = read_cameras(camera, shown)
+        views, speed = read_cameras(camera, shown)
     elif video:
-        fps = fps or 24
         with Console(stderr=True).status("Finding a path"):
-            views = film_views(shown, seconds=SECONDS if seconds is None else seconds, frames_per_second=fps)
-        cameras = CameraFile(views, fps)
+            views = film_views(shown, seconds=SECONDS if seconds is None else seconds, frames_per_second=fps or 24)
     elif view is None and shown.start is not None:
-        cameras = CameraFile([shown.start], None)
-    else:
-        cameras = CameraFile(list(shown.cameras) or [camera_in_front(shown)], None)
-    views = [each if width is None else each.zoomed(width / each.width) for each in cameras.cameras]
+        views = [shown.start]
+    views = [each if width is None else each.zoomed(width / each.width) for each in views]
     if video:  # whose colours have half the size
         views = [each._replace(width=each.width // 2 * 2, height=each.height // 2 * 2) for each in views]
     shown = shown.to(fastest_device())
-
-    def rendered(camera: Camera) -> Image.Image:
-        return image_of(render_view(shown, camera).rgb)
-
     if video:
-        speed = fps or cameras.frames_per_second or 24
+        speed = fps or speed or 24
         with replacing(out) as partial, progress_bar() as bar:
-            images = map(rendered, bar.track(views, description="Rendering"))
+            images = (image_of(render_view(shown, each).rgb) for each in bar.track(views, description="Rendering"))
             count = write_video(partial, images, frames_per_second=speed)
         print(f"{out}: {count} frames of {views[0].width} x {views[0].height} px, {count / speed:.1f} s")
         return 0
-    index, choices = view or 0, f"--view 0 to {len(views) - 1}"
-    if view is None and len(views) > 1:
-        raise ConfigError(f"there are {len(views)} cameras; choose one with {choices}, or write an .mp4")
-    if not 0 <= index < len(views):
-        raise ConfigError(f"there is no camera {view}; give {choices}")
-    write_image(out, rendered(views[index]))
+    index = view or 0
+    if (view is None and len(views) > 1) or not 0 <= index < len(views):
+        raise ConfigError(f"there are {len(views)} cameras; give --view 0 to {len(views) - 1}, or write an .mp4")
+    write_image(out, image_of(render_view(shown, views[index]).rgb))
     print(f"{out}: {views[index].width} x {views[index].height} px")
     return 0

@@ -11,14 +11,14 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
-from sundae_ns.cli.options import Out, Plain, Source
+from sundae_ns.cli.options import Hidden, Out, Plain, Source, word, words_of
 from sundae_ns.cli.poses import PoseOptions, check_poses
-from sundae_ns.cli.process import quoted, run_command, word
+from sundae_ns.cli.process import run_command
 from sundae_ns.cli.refusals import check_folder
-from sundae_ns.cli.train import FINETUNE_WORDS, TrainOptions, has_gpu, pack_run
-from sundae_ns.core.errors import STOPPED, ConfigError, DataError, StorageError, SundaeError, writing
+from sundae_ns.cli.train import TrainOptions, has_gpu, pack_run
+from sundae_ns.core.errors import STOPPED, ConfigError, DataError, StorageError, SundaeError
 from sundae_ns.core.files import put_aside, write_text
 from sundae_ns.data.capture_files import placed_in
 from sundae_ns.data.layouts import is_model, is_posed, no_transforms, posed_layout
@@ -51,6 +51,7 @@ class Project:
     """draft trains 3,000 steps; best loses less to a smaller size (pruning.max-drop 0.03)."""
     train: Plain[TrainOptions] = TrainOptions()
     poses: Plain[PoseOptions] = PoseOptions()
+    more: Hidden[tuple[str, ...]] = ()  # options of ns-train
 
     @cached_property
     def posed(self) -> bool:
@@ -75,32 +76,29 @@ class Project:
 
     def check(self) -> None:
         """Raise an error for photos that cannot be used, and for options that contradict each other."""
-        if not self.photos.exists():
-            raise DataError(f"{self.photos} does not exist; give a folder of photos, a video, or a capture")
+        draft, method = self.quality == "draft", self.train.method
         if not self.posed and ((self.photos / "sparse").is_dir() or is_model(self.photos)):
             raise no_transforms(self.photos)  # says how to use a capture in another layout
-        layout = posed_layout(self.photos) if self.posed else None
         self.train.check(self.photos)
-        draft, method = self.quality == "draft", self.train.method
-        if draft and self.train.steps is not None:
-            raise ConfigError(f"a draft has {DRAFT_STEPS:,} steps; leave out --steps or --quality")
-        if draft and method == "sundae-tiny":
-            raise ConfigError("sundae-tiny is shorter than a draft; leave out --quality")
+        if draft and (self.train.steps is not None or method == "sundae-tiny"):
+            raise ConfigError(f"a draft has {DRAFT_STEPS:,} steps, and sundae-tiny fewer; leave out --quality")
         if self.quality == "best" and (self.train.keep, self.train.count, method) != (None, None, "sundae"):
-            decides = "needs a method that decides the number of Gaussians; leave out --keep, --count and --method"
-            raise ConfigError(f"--quality best {decides}")
-        if layout is not None:
+            raise ConfigError("--quality best needs a method that decides; leave out --keep, --count and --method")
+        if self.posed and (layout := posed_layout(self.photos)) is not None:
             print(f"# capture in {layout.description}", flush=True)
 
     def plan(self) -> list[Step]:
         """The steps in their order; a capture needs no poses."""
         packed, report, page = (self.out / name for name in ("scene.sundae", "report/report.html", "scene.html"))
-        measure = ["sundae", "compare", word(self.run), word(packed), "--data", word(self.capture)]
-        measure += ["-o", word(report.parent), "--overwrite"]
-        export = ["sundae", "export", word(packed), "-o", word(page)]
+        data, export = ("--data", word(self.capture)), ["sundae", "export", word(packed), "-o", word(page)]
+        measure = ["sundae", "compare", word(self.run), word(packed), *data, "-o", word(report.parent), "--overwrite"]
+
+        def pack() -> int:
+            return pack_run(self.run, packed, *data, *self.train.pack_words, finetune=self.tunes)
+
         steps = [
             Step("train", self._train, self._trained),
-            Step("pack", lambda: self._pack(packed), lambda: read_sections(packed, read_header(packed)), packed),
+            Step("pack", pack, lambda: read_sections(packed, read_header(packed)), packed),
             Step("report", lambda: run_command(measure), lambda: _check_report(report), report),
             Step("web page", lambda: run_command(export), lambda: _check_page(page), page),
         ]
@@ -109,19 +107,19 @@ class Project:
 
     def _find_poses(self) -> int:
         put_aside(self.capture)  # damaged
-        return run_command(["sundae", "poses", word(self.photos), "-o", word(self.capture), *self.poses.words()])
+        options = words_of(self.poses, *vars(self.poses))
+        return run_command(["sundae", "poses", word(self.photos), "-o", word(self.capture), *options])
 
     def _train(self) -> int:
         """Train, or resume a training; ``DataError`` if too few photos have a pose."""
         if not self.posed and not (placed := placed_in(self.capture)).enough:
             counts = f"COLMAP placed {len(placed.placed)} of {placed.total} photos"
-            other = f"train on these with `sundae run {quoted(self.capture)} -o OTHER`"
+            other = f"train on these with `sundae run {shlex.quote(word(self.capture))} -o OTHER`"
             raise DataError(f"{counts}; {placed.again}, and start in another folder, or {other}")
         saved, options = self.run / "nerfstudio_models", self.train
         # The name may begin with a dash.
-        more = [f"--experiment-name={self.run.parent.parent.name}", "--timestamp", self.run.name]
+        more = [*self.more, f"--experiment-name={self.run.parent.parent.name}", "--timestamp", self.run.name]
         more += ["--vis", "viewer+tensorboard", "--viewer.websocket-host", "127.0.0.1"]
-        more += FINETUNE_WORDS if self.tunes else []
         if steps_left(self.run) is not None:
             more += ["--load-dir", word(saved)]
             options = replace(options, steps=None)
@@ -143,21 +141,15 @@ class Project:
             return left is not None
         return self.tunes and left <= tuned_steps(schedule_length(self.run / "config.yml"))
 
-    def _pack(self, packed: Path) -> int:
-        words = "--data", word(self.capture), *self.train.pack_words
-        return pack_run(self.run, packed, *words, finetune=self.tunes)
-
     def claim(self) -> None:
         """Make the folder and lock it, or check that an earlier command with the same settings made it."""
-        path, photos, masks = self.out / SETTINGS, self.photos.resolve(), self.poses.masks
-        settings: dict[str, Any] = {"photos": str(photos), "quality": self.quality}
-        settings |= {**asdict(self.train), **asdict(self.poses), "masks": str(masks.resolve()) if masks else None}
-        settings = json.loads(json.dumps(settings | settings.pop("advanced")))  # with lists for tuples, as in the file
+        path, given = self.out / SETTINGS, {"photos": self.photos, "quality": self.quality}
+        given |= {**asdict(self.train), **asdict(self.poses)}
+        settings = json.loads(json.dumps(given, default=lambda path: str(path.resolve())))
+        settings |= settings.pop("advanced")
         # An earlier command may have been killed after it made the lock.
         begun = self.out.is_dir() and all(name.startswith((LOCK, SETTINGS)) for name in os.listdir(self.out))
-        check_folder(self.out, reads=[photos], outside=self.photos, overwrite=begun or path.is_file() or None)
-        with writing(f"cannot make {self.out}"):
-            self.out.mkdir(parents=True, exist_ok=True)
+        check_folder(self.out, reads=[self.photos], outside=self.photos, overwrite=begun or path.is_file() or None)
         reserve(self.out, "works in {}; wait for it, or choose another folder")
         if not path.is_file():
             write_text(path, json.dumps(settings, indent=1) + "\n")
@@ -169,11 +161,8 @@ class Project:
             raise StorageError(f"{path} is damaged; choose another folder") from error
         for name, *values in changed:
             first, now = ("left out" if value is None else value for value in values)
-            again = "repeat the first command, or choose another folder"
-            if name == "max_mb" and self.train.max_mb is not None and self._trained():
-                size = f"--max-mb {self.train.max_mb:g}"
-                again = f"the finished run gets this size by `sundae pack {quoted(self.run)} -o FILE {size}`"
-            raise ConfigError(f"{self.out} was made with {name.replace('_', '-')} {first}, not {now}; {again}")
+            made = f"{self.out} was made with {name.replace('_', '-')} {first}, not {now}"
+            raise ConfigError(f"{made}; repeat the first command, or choose another folder")
 
 
 def run(project: Plain[Project]) -> int:
@@ -182,11 +171,16 @@ def run(project: Plain[Project]) -> int:
     Each step prints the command that it runs. The same command again skips the steps that are done, and resumes an
     interrupted training.
     """
-    out = project.out
     project.check()
     if not project.posed and not _passes(lambda: placed_in(project.capture)):
         check_poses(project.photos, project.poses, remarks=False)  # sundae poses prints them
     project.claim()
+    return carry_out(project)
+
+
+def carry_out(project: Project) -> int:
+    """Take the steps of a project that are not done; the exit code."""
+    out = project.out
     for number, step in enumerate(plan := project.plan(), start=1):
         heading = f"# step {number} of {len(plan)}, {step.name}"
         if _passes(step.check):

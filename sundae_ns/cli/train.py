@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
@@ -12,8 +11,8 @@ from typing import Annotated
 
 import tyro
 
-from sundae_ns.cli.options import Advanced, Details, Flag, Maybe, Out, Plain, Source, Wishes, words_of
-from sundae_ns.cli.process import run_command, word
+from sundae_ns.cli.options import Advanced, Details, File, Flag, Int, Out, Plain, Source, Wishes, word, words_of
+from sundae_ns.cli.process import run_command
 from sundae_ns.cli.refusals import check_folder, check_least
 from sundae_ns.core.errors import STOPPED, ConfigError, DataError
 from sundae_ns.core.tables import MEGABYTE
@@ -22,7 +21,7 @@ from sundae_ns.io.pack.config import FINETUNE_STEPS, FINETUNED_SIZE
 from sundae_ns.io.run_folder import new_name, unfinished_run
 
 PACKED = "scene.sundae"
-FINETUNE_WORDS = ("--finetune-steps", str(FINETUNE_STEPS))  # leaves the last steps to that of pack_run
+LENGTHS = ("--max-num-iterations", "--schedule-length", "--finetune-steps")  # options of ns-train
 
 
 @dataclass(frozen=True)
@@ -30,13 +29,13 @@ class TrainOptions(Wishes):
     """Options of a training that everyone sets; without an amount it keeps as many Gaussians as the scene needs."""
 
     method: str = "sundae"  # one of sundae, sundae-fast, -continuous, -paper; sundae-tiny suits small images and a CPU
-    steps: Maybe[int] = None  # number of training steps; by default that of the method
+    steps: Int = None  # number of training steps; by default that of the method
     advanced: Advanced[Details] = Details()
 
     def check(self, capture: Path) -> None:
         """Raise ``DataError`` if the capture does not exist, and ``ConfigError`` for a wrong option."""
         if not capture.exists():
-            raise DataError(f"{capture} does not exist; give the folder of a capture")
+            raise DataError(f"{capture} does not exist; check the path")
         if self.method not in methods():
             raise ConfigError(f"{self.method} is no method of sundae; use one of {', '.join(methods())}")
         self.check_wishes()
@@ -49,21 +48,23 @@ class TrainOptions(Wishes):
     ) -> list[str]:
         """The command of ``ns-train``, with ``more`` options and perhaps a parser of captures among them.
 
-        ``tunes`` says whether the pack is fine-tuned, ``masks`` is a folder of them for a capture in COLMAP's layout.
+        ``tunes`` says whether the pack is fine-tuned, which takes the place of the last steps of a long run; ``masks``
+        is a folder of them for a capture in COLMAP's layout.
         """
         words = ["ns-train", self.method, "--data", word(capture), "--output-dir", word(out)]
         # Trials count the bytes of packs without a fine-tune.
         most = None if self.max_mb is None else round(self.max_mb * MEGABYTE / (FINETUNED_SIZE if tunes else 1))
         given = {
-            "--pipeline.model.pruning.keep-ratio": None if self.keep is None else f"{self.keep:g}",
+            "--pipeline.model.pruning.keep-ratio": self.keep,
             "--pipeline.model.pruning.target-gaussians": self.count,
             "--pipeline.model.pruning.max-bytes": most,
             "--pipeline.model.head.mode": "off" if self.advanced.no_head else None,
             "--machine.seed": self.advanced.seed,
             "--max-num-iterations": self.steps,
         }
-        for option, value in given.items():
-            words += [] if value is None else [option, str(value)]
+        if tunes and not any(_value_of(option, more) for option in LENGTHS):
+            given["--finetune-steps"] = FINETUNE_STEPS
+        words += [text for option, value in given.items() if value is not None for text in (option, str(value))]
         layout = None if any(map(_is_parser, more)) else posed_layout(capture)
         of_masks = [] if masks is None else ["--masks-path", word(masks.resolve())]
         if of_masks and (layout is None or layout.words[0] != "colmap"):
@@ -88,7 +89,7 @@ def train(
     further: Annotated[tuple[str, ...], tyro.conf.Positional] = (),
     out: Out = Path("outputs"),
     resume: Flag = False,
-    masks: Maybe[Path] = None,
+    masks: File = None,
     options: Plain[TrainOptions] = TrainOptions(),  # noqa: B008
 ) -> int:
     """Print a command of ns-train and run it; then pack the scene into scene.sundae in the run's folder.
@@ -113,26 +114,19 @@ def train(
         raise no_transforms(capture)
     check_folder(out, reads=[], overwrite=True)
     (old, step, length), more = unfinished_run(out, options.method, capture) or (None, 0, 0), list(further)
-    if resume and old is None:
-        raise ConfigError(f"{out} has no unfinished run of {options.method} on {capture}; leave out --resume")
     name = (given := _value_of("--timestamp", more)) or new_name()
-    if resume and old is not None:
+    if resume:
+        if old is None:
+            raise ConfigError(f"{out} has no unfinished run of {options.method} on {capture}; leave out --resume")
         name = old.name
         more[:0] = [f"--experiment-name={old.parent.parent.name}", "--load-dir", word(old / "nerfstudio_models")]
     if resume or given is None:
         more[:0] = ["--timestamp", name]
-    tunes = has_gpu()
-    lengths = ("--max-num-iterations", "--schedule-length", "--finetune-steps")
-    if tunes and not any(_value_of(option, further) for option in lengths):
-        more[:0] = FINETUNE_WORDS
     # Refuses a damaged capture before runs are mentioned.
+    tunes = has_gpu()
     words = options.words(capture, out, more, tunes=tunes, masks=masks)
     if not resume and old is not None and not (old / PACKED).exists():
-        resuming = ["sundae", "train", word(capture), "--resume"]
-        resuming += ["-o", word(out)] if out != Path("outputs") else []
-        resuming += ["--method", options.method] if options.method != "sundae" else []
-        print(f"# {old} ended after {step:,} of {length:,} steps; this is a new run. To resume the other:")
-        print(f"#     {shlex.join(resuming)}")
+        print(f"# {old} ended after {step:,} of {length:,} steps; this is a new run; to resume the other, add --resume")
     code = run_command(words)
     # Options of ns-train may have put the run elsewhere; then its last line names the command that packs it.
     run = next((path.parent for path in out.glob(f"*/{options.method}/{name}/config.yml")), None)

@@ -8,7 +8,7 @@ from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
-from sundae_ns.cli.inputs import name_of, prepared_page
+from sundae_ns.cli.inputs import opened
 from sundae_ns.cli.options import Advanced, Flag, Plain, Scene, SceneDetails, Wishes
 from sundae_ns.core.errors import ConfigError
 from sundae_ns.scene.page import page_of
@@ -79,7 +79,7 @@ def view(
         no_open_browser: only print the address, and open no browser.
     """
     wishes.check_wishes()
-    page = page_of((name_of(scene), *prepared_page(scene, wishes, advanced)))
+    page = page_of(opened(scene, wishes, advanced, capture=True).shown())
     with serve(page, port) as server, suppress(KeyboardInterrupt):
         address = f"http://127.0.0.1:{server.server_port}/"
         print(f"{scene} is shown at {address} until Ctrl-C", flush=True)

@@ -10,6 +10,7 @@ from unittest.mock import Mock
 import pytest
 import torch
 from command_line import run
+from fake_colmap import FakeColmap
 
 from sundae_ns.cli import doctor
 from sundae_ns.core.errors import BackendError
@@ -153,11 +154,11 @@ def test_programs_packages_and_weights(monkeypatch, tmp_path):
     assert check("ffmpeg")[:2] == (True, f"{tmp_path / 'ffmpeg'}, for ns-render")
     monkeypatch.setattr(ctypes.util, "find_library", lambda _: None)
     assert not check("libGL")[0]
-    monkeypatch.setitem(sys.modules, "pycolmap", SimpleNamespace(__version__="4.2.1"))
+    monkeypatch.setitem(sys.modules, "pycolmap", FakeColmap())
     assert check("pycolmap")[1].startswith("4.2.1, for ")
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     works, text, remedy = check("pycolmap")
-    assert (works, text.partition(",")[0], remedy) == (False, "not installed", 'pip install "sundae_ns[photos]"')
+    assert (works, text.partition(";")[0], remedy) == (False, "camera poses need pycolmap", doctor.INSTALL)
     (tmp_path / "pycolmap.py").write_text("raise ImportError('libgomp.so.1: cannot open shared object file')")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "pycolmap")

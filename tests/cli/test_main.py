@@ -58,7 +58,7 @@ def test_the_installed_command_takes_any_name_and_no_warning_for_an_error(tmp_pa
     """Names of files may hold bytes that are no text."""
     environment = {**os.environ, "PYTHONWARNINGS": "error", "PYTHONUTF8": "1"}
     done = subprocess.run([SUNDAE, "train", b"\xff"], cwd=tmp_path, env=environment, capture_output=True, check=False)
-    refused = b"sundae: \\udcff does not exist; give the folder of a capture\n"
+    refused = b"sundae: \\udcff does not exist; check the path\n"
     assert (done.returncode, done.stdout, done.stderr) == (2, b"", refused)
 
 

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 from run_commands import NASTY
 
-from sundae_ns.cli.process import quoted, run_command, run_logged, word
+from sundae_ns.cli.options import word
+from sundae_ns.cli.process import run_command, run_logged
 from sundae_ns.core.errors import SundaeError
 
 CHILD = """
@@ -170,4 +171,3 @@ def test_a_signal_that_is_ignored_stays_ignored():
 
 def test_a_path_is_no_option():
     assert [word(Path(name)) for name in ("-a", "--help", "a", "/-a")] == ["./-a", "./--help", "a", "/-a"]
-    assert [quoted(Path(name)) for name in ("-a", "a b", "$(b)")] == ["./-a", "'a b'", "'$(b)'"]

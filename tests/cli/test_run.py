@@ -87,7 +87,7 @@ def test_a_size_and_a_quality(commands):
     pruning = config_of(commands.ran[1]).pipeline.model.pruning
     assert (pruning.max_bytes, pruning.max_drop) == (2_000_000, 0.03)
     pruning.validate()
-    assert commands.option("--max-mb", 2) == "2"
+    assert commands.option("--max-mb", 2) == "2.0"
     started(commands, "photos", "-o", "draft", "--quality", "draft")
     assert commands.option("--max-num-iterations", 1) == "3000"
     assert "--max-mb" not in commands.ran[2]
@@ -97,7 +97,7 @@ def test_a_gpu_packs_with_a_fine_tune(commands, capsys):
     commands.gpu = True
     started(commands, *OUT, "--max-mb", "2")
     assert commands.option("--finetune", 2) == commands.option("--finetune-steps", 1) == "1500"
-    assert commands.option("--max-mb", 2) == "2"
+    assert commands.option("--max-mb", 2) == "2.0"
     # Trials count the bytes of a pack without one.
     assert commands.option("--pipeline.model.pruning.max-bytes", 1) == "3333333"
     assert shlex.join(commands.ran[2]) in capsys.readouterr().out
@@ -210,7 +210,7 @@ def test_other_or_damaged_settings_are_refused(commands, capsys):
         (["--steps", "200"], "steps left out, not 200"),
         (["--keep", "0.5"], "keep left out, not 0.5"),
         (["--method", "sundae-tiny"], "method sundae, not sundae-tiny"),
-        (["--max-mb", "2"], f"size by `sundae pack {RUN} -o FILE --max-mb 2`"),
+        (["--max-mb", "2"], "max-mb left out, not 2.0; repeat the first command, or choose another folder"),
     ):
         assert cause in refusal(capsys, *OUT, *more)
     for text in ("[]", "{"):

@@ -36,7 +36,7 @@ def hostile(tiny, tmp_path, monkeypatch):
     shutil.copytree(tiny.scene, "CAPTURE")
     config = tiny.config.read_text().replace("\nload_step: null\n", f"\nload_step: {HOSTILE}")
     assert HOSTILE in config
-    for folder in ("RUN", "PROJECT/runs/CAPTURE/sundae-tiny/run", "DEMO/runs/demo/sundae-tiny/run"):
+    for folder in ("RUN", "PROJECT/runs/CAPTURE/sundae-tiny/run", "DEMO/runs/scene/sundae-tiny/run"):
         shutil.copytree(tiny.folder, folder)
         Path(folder, "config.yml").write_text(config)
     settings = {"photos": str(Path("CAPTURE").resolve()), "method": "sundae-tiny", "matching": "exhaustive"}
@@ -72,7 +72,7 @@ def test_no_command_runs_it(command, monkeypatch):
     def stop(server):
         raise KeyboardInterrupt
 
-    for module in ("run", "demo", "train"):
+    for module in ("run", "train"):
         monkeypatch.setattr(f"sundae_ns.cli.{module}.run_command", start)
     monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", stop)
     with pytest.raises(SystemExit):

@@ -16,7 +16,7 @@ class FakeColmap:
     """The functions that the stages call; ``calls`` counts images and pairs that are worked on."""
 
     CameraMode = SimpleNamespace(PER_FOLDER="per folder")
-    __spec__ = "that of a package that is installed"
+    __spec__, __version__ = "that of a package that is installed", "4.2.1"
 
     def __init__(self) -> None:
         self.logging = SimpleNamespace(minloglevel=0, Level=SimpleNamespace(FATAL=SimpleNamespace(value=3)))
