@@ -15,10 +15,10 @@ from sundae_ns.cli.pack import PackDetails, pack
 from sundae_ns.core.errors import CheckpointError, ConfigError, MemoryExhaustedError, PackError
 from sundae_ns.core.metrics import Quality, psnr
 from sundae_ns.io.formats import read_gaussians
+from sundae_ns.io.pack.codecs import Transform
 from sundae_ns.io.pack.config import FINETUNED, STEPS, PackConfig
 from sundae_ns.io.pack.container import read_header
 from sundae_ns.io.pack.packed_scene import fit_scene, pack_bytes, read_scene, write_fitted
-from sundae_ns.io.pack.quantize import Transform
 from sundae_ns.plugin import tuned_packs
 from sundae_ns.plugin.finished_runs import load_model, load_run
 from sundae_ns.plugin.tuned_packs import COARSEST, Candidate, RoundedTraining, Search, best_pack, finetune, scaled

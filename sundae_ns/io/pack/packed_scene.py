@@ -22,11 +22,20 @@ from sundae_ns.core.errors import PackError
 from sundae_ns.core.files import replacing
 from sundae_ns.core.gaussians import FEATURES, SPLAT_NAMES, finite_mask, num_gaussians
 from sundae_ns.io.budget import afford
-from sundae_ns.io.pack import container, entropy, quantize
-from sundae_ns.io.pack.codecs import Codecs, Sensitivity, as_matrix, fit_codecs
+from sundae_ns.io.pack import container, entropy
+from sundae_ns.io.pack.codecs import (
+    Blocks,
+    Codecs,
+    Sensitivity,
+    as_matrix,
+    dequantize_positions,
+    fit_codecs,
+    rotations_at,
+    rows_at,
+    weights_at,
+)
 from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.io.pack.container import FORMAT, MAX_RATIO, SPARE, Array, Levels, fault, fits, in_range
-from sundae_ns.io.pack.quantize import Blocks
 from sundae_ns.io.ply import check_gaussians
 
 CAMERAS: dict[str, dict[str, Any]] = FORMAT["sections"]["cameras"]
@@ -198,7 +207,7 @@ def _decode_head(file: _Sections) -> dict[str, Tensor]:
             head[name] = take("plain", sizes[name]).reshape(shape)
         else:
             steps = take("steps", shape[0])[:, None] * take("columns", shape[1])
-            head[name] = quantize.weights_at(take("levels", sizes[name]).reshape(shape), steps)
+            head[name] = weights_at(take("levels", sizes[name]).reshape(shape), steps)
             if not torch.isfinite(head[name]).all():
                 raise ValueError("the head has weights beyond float32")
     return head
@@ -236,13 +245,13 @@ def _decoded(file: _Sections, n: int, width: int, features: int) -> PackedScene:
 
     def quats() -> Array:
         coded, step = levels("quats", 3)
-        return np.asarray(quantize.rotations_at(torch.from_numpy(coded), step).numpy())
+        return np.asarray(rotations_at(torch.from_numpy(coded), step).numpy())
 
     def rows(name: str, channels: int) -> Array:
         coded, step = levels(name, channels)
         mean = _array(file, name, "mean", width=channels)
         basis = _array(file, name, "basis", square=channels**2).reshape(channels, channels)
-        return quantize.rows_at(coded, mean, basis, step)
+        return rows_at(coded, mean, basis, step)
 
     with ThreadPoolExecutor(2) as pool:
         # The largest jobs come first, so that the threads end together.
@@ -251,7 +260,7 @@ def _decoded(file: _Sections, n: int, width: int, features: int) -> PackedScene:
         head = pool.submit(_decode_head, file)
         jobs["quats"] = pool.submit(quats)
         jobs |= {name: pool.submit(rows, name, channels) for name, channels in narrow.items()}
-        jobs["means"] = pool.submit(quantize.dequantize_positions, blocks, bits, size)
+        jobs["means"] = pool.submit(dequantize_positions, blocks, bits, size)
         gaussians = {name: torch.from_numpy(job.result()) for name, job in jobs.items()}
     gaussians["features_rest"] = gaussians.get("features_rest", torch.zeros(0)).reshape(n, width // 3, 3)
     ordered = {name: gaussians[name] for name in (*SPLAT_NAMES, FEATURES) if name in gaussians}

@@ -11,7 +11,8 @@ from fields import matched, random_field
 from packed_scenes import full_scene
 
 from sundae_ns.core.errors import ConfigError, PackError
-from sundae_ns.io.pack import container, quantize
+from sundae_ns.io.pack import container
+from sundae_ns.io.pack.codecs import aligned, rotation_bound
 from sundae_ns.io.pack.config import STEPS, PackConfig
 from sundae_ns.io.pack.container import read_header
 from sundae_ns.io.pack.packed_scene import PackedScene, read_scene, write_scene
@@ -30,7 +31,7 @@ def test_everything_is_decoded_within_the_stated_bounds(tmp_path, config):
     about = read_header(path).meta["attributes"]
     found = matched(scene.gaussians, truth)
     # The axes of ellipsoids come in another order.
-    quats, scales = quantize.aligned(truth["quats"].numpy(), truth["scales"].numpy())
+    quats, scales = aligned(truth["quats"].numpy(), truth["scales"].numpy())
     truth["scales"] = torch.from_numpy(scales)
     assert [*found] == [*truth]
     for name in ("scales", "features_dc", "features_rest", "opacities", "features"):
@@ -41,7 +42,7 @@ def test_everything_is_decoded_within_the_stated_bounds(tmp_path, config):
         assert off.max() > 0.3 * bound.min(), name
     assert (found["means"] - truth["means"]).abs().max() < 7 / 2**config.position_bits
     turned = (found["quats"] * torch.from_numpy(quats)).sum(dim=1).abs().clamp(max=1)
-    assert 2 * torch.arccos(turned).max() <= quantize.rotation_bound(config.rotation_step) + 1e-3
+    assert 2 * torch.arccos(turned).max() <= rotation_bound(config.rotation_step) + 1e-3
     assert torch.equal(scene.head["a.bias"], given.head["a.bias"])
     off = (scene.head["a.weight"] - given.head["a.weight"]).abs().reshape(4, -1)
     largest = given.head["a.weight"].reshape(4, -1).abs().amax(dim=1, keepdim=True)

@@ -1,4 +1,4 @@
-// Numbers of the sections back to values; the twin of sundae_ns/io/pack/quantize.py and transform.py.
+// Numbers of the sections back to values; the twin of sundae_ns/io/pack/codecs.py.
 
 /** Every third bit of a number of at most 24 bits, moved together. */
 function everyThird(bits: number): number {
