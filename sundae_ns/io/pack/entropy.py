@@ -37,79 +37,82 @@ _STRETCH = np.searchsorted(_SQUASH, np.arange(4096), side="left").clip(0, 4094).
 _RATES = (65536 * 5 // (5 * np.arange(256) + 8)).astype(np.int32)
 
 
-@inlined  # with _decided: a call for each decision took a third of the time
+@inlined  # as _decided and _number, so that the four numbers of the coder stay in registers: half the time
 def _coded(coder, stream, chance, bit):  # type: ignore[no-untyped-def]
-    """Write a bit that is 1 with ``chance`` of 65536, or read it if ``bit`` is -1; return it."""
-    low, high = coder[0], coder[1]
+    """Write a bit that is 1 with ``chance`` of 65536, or read it if ``bit`` is -1; the bit, and the coder after it."""
+    low, high, code, place = coder
+    reading = bit < 0
     reach = high - low
     middle = low + (reach >> 16) * chance + (((reach & 0xFFFF) * chance) >> 16)
-    if bit < 0:
-        bit = 1 if coder[2] <= middle else 0
-        reading = True
-    else:
-        reading = False
+    if reading:
+        bit = 1 if code <= middle else 0
     if bit == 1:
         high = middle
     else:
         low = middle + 1
     while (low ^ high) >> 24 == 0:
-        place = coder[3]
         if reading:
-            byte = stream[place] if place < len(stream) else 0
-            coder[2] = ((coder[2] << 8) & _MASK) | byte
+            code = ((code << 8) & _MASK) | (stream[place] if place < len(stream) else 0)
         else:
             stream[place] = high >> 24
-        coder[3] = place + 1
+        place += 1
         low = (low << 8) & _MASK
         high = ((high << 8) & _MASK) | 255
-    coder[0], coder[1] = low, high
-    return bit
+    return bit, (low, high, code, place)
 
 
 @compiled
 def _chances(contexts, decisions):  # type: ignore[no-untyped-def]
-    """Chances in all contexts, 16 bits above the count of their decisions, weights of the mix, places, and scratch."""
+    """Chances in all contexts, 16 bits above the count of their decisions, and the weights of the mix."""
     model = np.full(contexts * _NODES, _EVEN << 7, np.int32)
-    weights = np.full((decisions * _NODES, CONTEXTS), 0x5000, np.int32)
-    return model, weights, np.zeros(CONTEXTS, np.int64), np.zeros(CONTEXTS, np.int64)
+    return model, np.full((decisions * _NODES, CONTEXTS), 0x5000, np.int32)
 
 
 @inlined
-def _decided(coder, stream, chances, row, node, bit):  # type: ignore[no-untyped-def]
-    """Code the decision ``node`` with the mix of its chances in the contexts at ``places``, and adapt them."""
-    model, weights, places, scores = chances
-    total = 0
-    for c in range(CONTEXTS):
-        scores[c] = _STRETCH[model[places[c] + node] >> 11]
-        total += scores[c] * weights[row, c]
+def _adapted(model, weights, row, context, place, score, error, bit):  # type: ignore[no-untyped-def]
+    """Adapt the chance in a context, and its weight in the mix."""
+    weight = weights[row, context] + ((score * error + 0x8000) >> 16)
+    weights[row, context] = min(max(weight, -(1 << 19)), 1 << 19)
+    count, chance = model[place] & 127, model[place] >> 7
+    moved = chance + ((((bit * 65535 - chance) >> 3) * _RATES[count]) >> 13)
+    model[place] = min(max(moved, 16), 65519) << 7 | min(count + 1, 127)
+
+
+@inlined
+def _decided(coder, stream, chances, kinds, row, node, bit):  # type: ignore[no-untyped-def]
+    """Code the decision ``node`` with the mix of its chances in four contexts, and adapt them; the bit, the coder."""
+    model, weights = chances
+    a, b = kinds[0] * _NODES + node, kinds[1] * _NODES + node
+    c, d = kinds[2] * _NODES + node, kinds[3] * _NODES + node
+    of_a, of_b = _STRETCH[model[a] >> 11], _STRETCH[model[b] >> 11]
+    of_c, of_d = _STRETCH[model[c] >> 11], _STRETCH[model[d] >> 11]
+    total = of_a * weights[row, 0] + of_b * weights[row, 1] + of_c * weights[row, 2] + of_d * weights[row, 3]
     chance = _SQUASH[min(max(total >> 16, -2047), 2047) + 2047]
-    bit = _coded(coder, stream, chance << 4, bit)
+    bit, coder = _coded(coder, stream, chance << 4, bit)
     error = ((bit << 12) - chance) * 10
-    for c in range(CONTEXTS):
-        weights[row, c] = min(max(weights[row, c] + ((scores[c] * error + 0x8000) >> 16), -(1 << 19)), 1 << 19)
-        place = places[c] + node
-        count = model[place] & 127
-        chance = model[place] >> 7
-        moved = chance + ((((bit * 65535 - chance) >> 3) * _RATES[count]) >> 13)
-        model[place] = min(max(moved, 16), 65519) << 7 | min(count + 1, 127)
-    return bit
+    _adapted(model, weights, row, 0, a, of_a, error, bit)
+    _adapted(model, weights, row, 1, b, of_b, error, bit)
+    _adapted(model, weights, row, 2, c, of_c, error, bit)
+    _adapted(model, weights, row, 3, d, of_d, error, bit)
+    return bit, coder
 
 
-@compiled
-def _number(coder, stream, chances, first, value, reading):  # type: ignore[no-untyped-def]
-    """Code a number: is it 0, its sign, how many binary digits it has, and these; return it."""
-    bit = -1 if reading else (1 if value == 0 else 0)
-    if _decided(coder, stream, chances, first, 0, bit) == 1:
-        return 0
+@inlined
+def _number(coder, stream, chances, kinds, first, value, reading):  # type: ignore[no-untyped-def]
+    """Code a number: is it 0, its sign, how many binary digits it has, and these; the number, and the coder."""
+    bit, coder = _decided(coder, stream, chances, kinds, first, 0, -1 if reading else (1 if value == 0 else 0))
+    if bit == 1:
+        return 0, coder
     bit = -1 if reading else (1 if value < 0 else 0)
-    negative = _decided(coder, stream, chances, first + 1, 1, bit)
+    negative, coder = _decided(coder, stream, chances, kinds, first + 1, 1, bit)
     size = abs(value)
     side = _SIDE * negative
     digits = 0
     while digits < _LAST - 1:
         node = side + min(2 + digits, 17)
         bit = -1 if reading else (1 if size >> (digits + 1) > 0 else 0)
-        if _decided(coder, stream, chances, first + node, node, bit) == 0:
+        bit, coder = _decided(coder, stream, chances, kinds, first + node, node, bit)
+        if bit == 0:
             break
         digits += 1
     found = 1
@@ -117,11 +120,11 @@ def _number(coder, stream, chances, first, value, reading):  # type: ignore[no-u
         bit = -1 if reading else (size >> (digits - 1 - k)) & 1
         if k < 2 and digits < 15:
             node = side + 18 + 3 * digits + (k + (found & 1) if k else 0)
-            bit = _decided(coder, stream, chances, first + node, node, bit)
+            bit, coder = _decided(coder, stream, chances, kinds, first + node, node, bit)
         else:
-            bit = _coded(coder, stream, _EVEN, bit)
+            bit, coder = _coded(coder, stream, _EVEN, bit)
         found = 2 * found + bit
-    return -found if negative == 1 else found
+    return -found if negative == 1 else found, coder
 
 
 @compiled
@@ -145,11 +148,10 @@ def _signed(value):  # type: ignore[no-untyped-def]
 
 @compiled
 def _run(levels, near, stream, coder, reading):  # type: ignore[no-untyped-def]
-    """Code levels ``[N, C]`` row after row."""
+    """Code levels ``[N, C]`` row after row; the coder after them."""
     n, width = levels.shape
     each = 63 + _CLASSES * _CLASSES
     chances = _chances(width * each, width)
-    places = chances[2]
     for i in range(n):
         total = 0
         for k in range(width):
@@ -163,12 +165,12 @@ def _run(levels, near, stream, coder, reading):  # type: ignore[no-untyped-def]
                     if q == 0:
                         nearest = value
             start = k * each
-            places[0] = start * _NODES
-            places[1] = (start + 1 + _signed(nearest)) * _NODES
-            places[2] = (start + 32 + _signed(around >> 2)) * _NODES
-            places[3] = (start + 63 + _magnitude(amount >> 1) * _CLASSES + _magnitude(total)) * _NODES
-            levels[i, k] = _number(coder, stream, chances, k * _NODES, levels[i, k], reading)
-            total += abs(levels[i, k])
+            sizes = _magnitude(amount >> 1) * _CLASSES + _magnitude(total)
+            kinds = start, start + 1 + _signed(nearest), start + 32 + _signed(around >> 2), start + 63 + sizes
+            value, coder = _number(coder, stream, chances, kinds, k * _NODES, levels[i, k], reading)
+            levels[i, k] = value
+            total += abs(value)
+    return coder
 
 
 @compiled
@@ -193,9 +195,8 @@ def _search(cells, block, near):  # type: ignore[no-untyped-def]
 
 @compiled
 def _run_gaps(codes, block, bits, stream, coder, reading):  # type: ignore[no-untyped-def]
-    """Code ascending Morton codes ``[N]``: the number of digits of each difference, and its digits."""
+    """Code ascending Morton codes ``[N]``: the number of digits of each difference, and its digits; the coder after."""
     chances = _chances(1 + 3 * 64, 1)
-    places = chances[2]
     last, before, average = 0, 0, 0
     for i in range(len(codes)):
         gap, digits = 0, 0
@@ -204,13 +205,12 @@ def _run_gaps(codes, block, bits, stream, coder, reading):  # type: ignore[no-un
             gap = codes[i] - previous
             while gap >> digits > 0:
                 digits += 1
-        places[1] = (1 + last) * _NODES
-        places[2] = (65 + before) * _NODES
-        places[3] = (129 + (average >> 2)) * _NODES
+        kinds = 0, 1 + last, 65 + before, 129 + (average >> 2)
         node = 1
         for k in range(6):
             bit = -1 if reading else (digits >> (5 - k)) & 1
-            node = 2 * node + _decided(coder, stream, chances, node, node, bit)
+            bit, coder = _decided(coder, stream, chances, kinds, node, node, bit)
+            node = 2 * node + bit
         digits = min(node - 64, 3 * bits)
         found = min(digits, 1)
         for k in range(digits - 2, -1, -1):
@@ -218,14 +218,15 @@ def _run_gaps(codes, block, bits, stream, coder, reading):  # type: ignore[no-un
             kind = digits - 2 - k
             if kind < 2:
                 node = 64 + (1 if kind == 0 else found & 3)
-                bit = _decided(coder, stream, chances, node, node, bit)
+                bit, coder = _decided(coder, stream, chances, kinds, node, node, bit)
             else:
-                bit = _coded(coder, stream, _EVEN, bit)
+                bit, coder = _coded(coder, stream, _EVEN, bit)
             found = 2 * found + bit
         # A hostile stream must not leave the grid.
         codes[i] = min(previous + found, (1 << 3 * bits) - 1)
         last, before = digits, last
         average += digits - (average >> 2)
+    return coder
 
 
 def encode_gaps(codes: NDArray[np.uint64], block: int, bits: int) -> Stream:
@@ -266,20 +267,19 @@ def decode_levels(stream: Stream, width: int, near: Near) -> Levels:
     return levels
 
 
-def _written(run: Callable[..., None], size: int, *arguments: Any) -> Stream:
+def _written(run: Callable[..., tuple[int, ...]], size: int, *arguments: Any) -> Stream:
     """The bytes that a loop writes, at most ``size``."""
-    stream, coder = np.zeros(size, np.uint8), np.array([0, _MASK, 0, 0], np.int64)
-    run(*arguments, stream, coder, False)
+    stream = np.zeros(size, np.uint8)
+    _, high, _, end = run(*arguments, stream, (0, _MASK, 0, 0), False)
     # One more byte: it and the zeros that a decoder adds are between the two ends.
-    end = int(coder[3])
-    stream[end] = int(coder[1]) >> 24
+    stream[end] = high >> 24
     return stream[: end + 1]
 
 
-def _read(run: Callable[..., None], stream: Stream, *arguments: Any) -> None:
+def _read(run: Callable[..., tuple[int, ...]], stream: Stream, *arguments: Any) -> None:
     """Fill the arguments of a loop from a stream; refuse a stream of more or fewer numbers."""
-    coder = np.array([0, _MASK, int.from_bytes(bytes(stream[:4]).ljust(4, b"\0"), "big"), 4], np.int64)
-    run(*arguments, stream.copy(), coder, True)  # the loop takes no read-only arrays
+    coder = 0, _MASK, int.from_bytes(bytes(stream[:4]).ljust(4, b"\0"), "big"), 4
+    *_, place = run(*arguments, stream.copy(), coder, True)  # the loop takes no read-only arrays
     # A decoder has read four bytes where the encoder wrote the last one.
-    if int(coder[3]) - 3 != len(stream):
+    if place - 3 != len(stream):
         raise ValueError("a stream does not end with its last number")
