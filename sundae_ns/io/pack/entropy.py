@@ -105,8 +105,7 @@ def _number(coder, stream, chances, kinds, first, value, reading):  # type: igno
         return 0, coder
     bit = -1 if reading else (1 if value < 0 else 0)
     negative, coder = _decided(coder, stream, chances, kinds, first + 1, 1, bit)
-    size = abs(value)
-    side = _SIDE * negative
+    size, side = abs(value), _SIDE * negative
     digits = 0
     while digits < _LAST - 1:
         node = side + min(2 + digits, 17)
@@ -130,10 +129,7 @@ def _number(coder, stream, chances, kinds, first, value, reading):  # type: igno
 @compiled
 def _magnitude(value):  # type: ignore[no-untyped-def]
     """Class of a magnitude, 0 to 15: two classes for each doubling."""
-    size = abs(value)
-    if size < 4:
-        return size
-    digits = 0
+    size, digits = abs(value), 0
     while size >> digits > 3:
         digits += 1
     return min(2 * digits + (size >> digits), _CLASSES - 1)

@@ -35,7 +35,7 @@ from sundae_ns.io.pack.codecs import (
     weights_at,
 )
 from sundae_ns.io.pack.config import PackConfig
-from sundae_ns.io.pack.container import FORMAT, MAX_RATIO, SPARE, Array, Levels, fault, fits, in_range
+from sundae_ns.io.pack.container import FORMAT, MAX_RATIO, SPARE, Array, Coded, Levels, fault, fits, in_range
 from sundae_ns.io.ply import check_gaussians
 
 CAMERAS: dict[str, dict[str, Any]] = FORMAT["sections"]["cameras"]
@@ -132,14 +132,18 @@ def pack_bytes(scene: PackedScene, codecs: Codecs) -> tuple[bytes, dict[str, int
     arrays["means/gaps"] = entropy.encode_gaps(blocks.codes, config.block, config.position_bits)
     about: dict[str, Any] = {"means": {"codec": "blocks", "bits": config.position_bits, "block": config.block}}
     near = entropy.neighbours_of(blocks.cells, config.block)
-    coded = {name: (codec.encode(as_matrix(scene.gaussians[name])), near) for name, codec in codecs.gaussians.items()}
-    if codecs.head is not None:
-        head = codecs.head.encode(scene.head)
-        coded["head"] = head, entropy.predecessors(len(head[1]))
+
+    def coded(name: str) -> tuple[Coded, entropy.Stream]:
+        codec: Any = codecs.gaussians.get(name, codecs.head)
+        stored = codec.encode(scene.head if name == "head" else as_matrix(scene.gaussians[name]))
+        around = entropy.predecessors(len(stored[1])) if name == "head" else near
+        return stored, entropy.encode_levels(stored[1], around)
+
+    names = [*codecs.gaussians, *(["head"] if scene.head else [])]
     with ThreadPoolExecutor(2) as pool:
-        streams = pool.map(lambda stored: entropy.encode_levels(stored[0][1], stored[1]), coded.values())
-        for (name, ((entry, _, parts), _)), stream in zip(coded.items(), streams, strict=True):
-            about[name] = entry
+        jobs = {name: pool.submit(coded, name) for name in reversed(names)}  # the largest first, as in _decoded
+        for name in names:
+            (about[name], _, parts), stream = jobs[name].result()
             arrays |= {f"{name}/levels": stream, **{f"{name}/{part}": array for part, array in parts.items()}}
     if scene.cameras is not None:
         for name, section in CAMERAS.items():
@@ -237,8 +241,6 @@ def read_scene(path: Path) -> PackedScene:
 def _decoded(file: _Sections, n: int, width: int, features: int) -> PackedScene:
     bits, size = (int(_about(file, "means")[key]) for key in ("bits", "block"))
     low, high = (_array(file, "means", end, blocks=-(-n // size)) for end in ("low", "high"))
-    blocks = Blocks(entropy.decode_gaps(_array(file, "means", "gaps"), n, size, bits), low, high)
-    near = entropy.neighbours_of(blocks.cells, size)
 
     def levels(name: str, channels: int) -> tuple[Levels, float]:
         return entropy.decode_levels(_array(file, name, "levels"), channels, near), float(_about(file, name)["step"])
@@ -254,10 +256,12 @@ def _decoded(file: _Sections, n: int, width: int, features: int) -> PackedScene:
         return rows_at(coded, mean, basis, step)
 
     with ThreadPoolExecutor(2) as pool:
-        # The largest jobs come first, so that the threads end together.
+        # A head needs no positions. Then the largest jobs come first, so that the threads end together.
+        head = pool.submit(_decode_head, file)
+        blocks = Blocks(entropy.decode_gaps(_array(file, "means", "gaps"), n, size, bits), low, high)
+        near = entropy.neighbours_of(blocks.cells, size)
         wide, narrow = {"features_rest": width, FEATURES: features}, {"scales": 3, "features_dc": 3, "opacities": 1}
         jobs = {name: pool.submit(rows, name, channels) for name, channels in wide.items() if channels}
-        head = pool.submit(_decode_head, file)
         jobs["quats"] = pool.submit(quats)
         jobs |= {name: pool.submit(rows, name, channels) for name, channels in narrow.items()}
         jobs["means"] = pool.submit(dequantize_positions, blocks, bits, size)
