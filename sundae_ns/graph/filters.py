@@ -9,8 +9,6 @@ from __future__ import annotations
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, dia_array
-from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from sundae_ns.core.errors import DataError
@@ -69,24 +67,24 @@ class Smoother:
     """
 
     def __init__(self, graph: NeighborGraph, strength: float) -> None:
+        from scipy.sparse import csr_array, dia_array, linalg  # take half a second, also where nothing is smoothed
+
         n, k = graph.indices.shape
+        self._factors = linalg.splu
+        self._diagonal = lambda values: dia_array((values[None], [0]), shape=(n, n))
         values, columns = graph.weights.detach().double().cpu().numpy().ravel(), graph.indices.cpu().numpy().ravel()
         directed = csr_array((values, (np.repeat(np.arange(n), k), columns)), shape=(n, n))
         weights = 0.5 * (directed + directed.T)
         degrees = np.asarray(weights.sum(axis=1)).ravel()
         scale = strength / degrees.mean() if degrees.any() else 0.0
-        self._laplacian = scale * (_diagonal(degrees) - weights)
+        self._laplacian = scale * (self._diagonal(degrees) - weights)
         self._known: NDArray[np.bool_] | None = None
 
     def __call__(self, signal: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:
         """The smooth part of a signal ``[N, D]``, read where a node is known, bool ``[N]``; a value for every node."""
         if self._known is None or (known != self._known).any():  # factors are kept, as few calls change the nodes
             # Unknown values have a small weight: one without a path to a known value would have no equation.
-            self._solve = splu((_diagonal(np.maximum(known, 1e-9)) + self._laplacian).tocsc()).solve
+            self._solve = self._factors((self._diagonal(np.maximum(known, 1e-9)) + self._laplacian).tocsc()).solve
             self._known = known.copy()
         smooth: NDArray[np.float64] = self._solve(np.where(known[:, None], signal, 0.0))
         return smooth
-
-
-def _diagonal(values: NDArray[np.float64]) -> dia_array:
-    return dia_array((values[None], [0]), shape=(len(values), len(values)))
