@@ -77,17 +77,20 @@ def exit_with(command: Callable[[], int], name: str) -> NoReturn:
     try:
         # Commands name the file that they cannot write; this covers others, such as a full disk behind stdout.
         with writing(f"{name} ended early"):
-            code = command()
-            sys.stdout.flush()
-    except SundaeError as error:
+            try:
+                code = command()
+            finally:
+                sys.stdout.flush()
+    except (SundaeError, BrokenPipeError) as error:
+        if early := isinstance(error, BrokenPipeError) or " ended early: " in str(error):
+            sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - at its end Python would write the rest, and fail
+        if isinstance(error, BrokenPipeError):  # the reader of stdout has left, as head does
+            sys.exit(141)
         if os.environ.get("SUNDAE_TRACEBACK"):
             raise
-        file = getattr(error.__cause__, "filename", None) if " ended early: " in str(error) else None
+        file = getattr(error.__cause__, "filename", None) if early else None
         print(f"sundae: {f'{file}: ' if file else ''}{error}", file=sys.stderr)
         sys.exit(2)
-    except BrokenPipeError:  # the reader of stdout has left, as head does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(141)
     except KeyboardInterrupt:
         if not os.environ.get(STEP):  # the command that started this one says so
             print("sundae: interrupted", file=sys.stderr)
@@ -101,6 +104,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if arguments is None:
         warnings.simplefilter("ignore")  # of libraries; PYTHONWARNINGS=error would make them errors
         logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it looks for a home
+        for name in ("stdout", "stderr"):
+            if getattr(sys, name) is None:  # it is closed; else the next file that opens would get its number
+                setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
         for stream in (sys.stdout, sys.stderr):  # names of files may hold bytes that are no text
             if isinstance(stream, io.TextIOWrapper):
                 stream.reconfigure(errors="backslashreplace")

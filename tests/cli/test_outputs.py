@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -120,23 +121,37 @@ def test_a_full_disk_is_one_line(here, full, capsys):
         assert not out.exists()
 
 
-def installed(unbuffered, **options):
-    """The installed command that prints its help, in a process."""
-    words = [Path(sys.executable).parent / "sundae", "help"]
+BUFFERED = pytest.mark.parametrize("unbuffered", ["", "1"])
+PRINTING = pytest.mark.parametrize("words", ["help", "info --help"])
+
+
+def installed(words, unbuffered, **options):
+    """The installed command in a process."""
+    words = [Path(sys.executable).parent / "sundae", *words.split()]
     environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
     return subprocess.Popen(words, stderr=subprocess.PIPE, env=environment, **options)
 
 
-def test_a_full_disk_behind_stdout_is_one_line():
-    with open("/dev/full", "w") as nowhere, installed("1", stdout=nowhere) as process:
+@BUFFERED
+@PRINTING
+def test_a_full_disk_behind_stdout_is_one_line(words, unbuffered):
+    with open("/dev/full", "w") as nowhere, installed(words, unbuffered, stdout=nowhere) as process:
         (line,) = process.stderr.read().splitlines()
     assert b"disk is full" in line
     assert process.returncode == 2
 
 
-@pytest.mark.parametrize("unbuffered", ["", "1"])
-def test_a_reader_of_stdout_that_has_left_is_no_error(unbuffered):
-    with installed(unbuffered, stdout=subprocess.PIPE) as process:
+@BUFFERED
+@PRINTING
+def test_a_reader_of_stdout_that_has_left_is_no_error(words, unbuffered):
+    with installed(words, unbuffered, stdout=subprocess.PIPE) as process:
         process.stdout.close()
         assert process.stderr.read() == b""
     assert process.returncode == 141
+
+
+@PRINTING
+def test_a_closed_stdout_is_no_error(words):
+    with installed(words, "", preexec_fn=partial(os.close, 1)) as process:
+        assert process.stderr.read() == b""
+    assert process.returncode == 0
