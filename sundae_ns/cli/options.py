@@ -11,10 +11,10 @@ from typing import Annotated, Any, TypeVar
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from tyro.constructors import PrimitiveConstructorSpec
 
 from sundae_ns.cli.refusals import check_exclusive, check_least
 from sundae_ns.core.errors import ConfigError
+from sundae_ns.core.tables import Share
 
 T = TypeVar("T")
 # Options that may be left out: their help names the type, not None beside it.
@@ -31,18 +31,6 @@ Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]  # without a --no- form
 Overwrite = Annotated[Flag, tyro.conf.arg(help="replace an earlier output, once the new one is complete.")]
 Box = tuple[float, float, float, float, float, float]
-
-
-def _share(words: list[str]) -> float:
-    value = float(words[0].removesuffix("%"))
-    return value / 100 if words[0].endswith("%") else value
-
-
-Share = Annotated[
-    float,
-    PrimitiveConstructorSpec(1, "SHARE", _share, lambda value: isinstance(value, float), lambda value: [f"{value:g}"]),
-]
-"""A share of the Gaussians: ``0.25`` or ``25%``."""
 
 
 @dataclass(frozen=True)

@@ -46,11 +46,6 @@ class Crop(NamedTuple):
     mirrored: bool = False
 
 
-def camera_center(viewmat: Tensor) -> Tensor:
-    """Position of a camera ``[3]``, from its world-to-camera transform ``[4, 4]``."""
-    return -viewmat[:3, :3].T @ viewmat[:3, 3]
-
-
 class Camera(NamedTuple):
     """One camera in the rasteriser's form."""
 
@@ -129,7 +124,7 @@ class Camera(NamedTuple):
     @property
     def center(self) -> Tensor:
         """Camera centre, world units ``[3]``."""
-        return camera_center(self.viewmat)
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
     @property
     def pose(self) -> Tensor:

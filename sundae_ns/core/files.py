@@ -116,18 +116,17 @@ def write_video(path: Path, frames: Iterable[Image.Image], *, frames_per_second:
     """
     import av
 
-    count = 0
+    count = -1
     with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as container:
         stream = container.add_stream(
             "libx264", rate=Fraction(frames_per_second).limit_denominator(1001), options={"crf": "18"}
         )
         stream.pix_fmt = "yuv420p"
         stream.codec_context.colorspace = 1  # BT.709; without it, players guess from the size
-        for image in frames:
+        for count, image in enumerate(frames):
             if count == 0:
                 stream.width, stream.height = image.size
             frame = av.VideoFrame.from_image(image).reformat(format="yuv420p", dst_colorspace=1)
             container.mux(stream.encode(frame))
-            count += 1
         container.mux(stream.encode(None))
-    return count
+    return count + 1

@@ -136,8 +136,7 @@ def evaluate(render: Callable[[AnyCamera], Tensor], cameras: Iterable[AnyCamera]
     for camera, target in zip(cameras, targets, strict=True):
         image = render(camera)
         values.append([float(metric(image, target.to(image))) for metric in (psnr, ssim)])
-    psnrs, ssims = zip(*values, strict=True)
-    return Quality(psnrs, ssims)
+    return Quality(*zip(*values, strict=True))
 
 
 @dataclass(frozen=True)

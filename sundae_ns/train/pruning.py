@@ -18,7 +18,7 @@ from torch import Tensor
 
 from sundae_ns.core.errors import ConfigError, SundaeError
 from sundae_ns.core.files import write_text
-from sundae_ns.core.tables import without_nan
+from sundae_ns.core.tables import Share, without_nan
 from sundae_ns.core.timing import now, peak_memory
 from sundae_ns.io.run_folder import PRUNES, prunes_before
 from sundae_ns.pruning.decision import Pruner
@@ -57,8 +57,8 @@ class PruningConfig(PruneRule):
     mode: Literal["one-shot", "continuous", "off"] = "one-shot"
     """Prune once (one-shot, the paper's main strategy), periodically during densification for less peak memory
     (continuous), or never (off)."""
-    keep_ratio: float | None = USUAL_SHARE
-    """Share of the N Gaussians that one prune keeps, in (0, 1]: exactly round(keep_ratio * N). One-shot: None lets
+    keep_ratio: Share | None = USUAL_SHARE
+    """Share of the N Gaussians that one prune keeps, in (0, 1] or as 25%: round(keep_ratio * N). One-shot: None lets
     trials on held-out training views decide the number."""
     prune_at: int = 12000  # Step after which the one-shot prune happens
     start: int = 2000  # First step of continuous pruning

@@ -55,6 +55,11 @@ def test_further_options_and_the_parser_of_a_capture(commands):
     assert config_of(words[: words.index("colmap")]).pipeline.model.sh_degree == 1
 
 
+@pytest.mark.parametrize(("word", "share"), [("0.25", 0.25), ("25%", 0.25), ("None", None)])
+def test_a_share_of_ns_train_may_be_per_cent(word, share):
+    assert config_of(["", "", "--pipeline.model.pruning.keep-ratio", word]).pipeline.model.pruning.keep_ratio == share
+
+
 def test_a_capture_of_blender_is_read_over_white(commands):
     Path("scene/transforms.json").unlink()
     for split in ("train", "val", "test"):

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from sundae_ns.core import timing as timing_module
-from sundae_ns.core.errors import ConfigError
 from sundae_ns.core.timing import median_ms, peak_memory
 
 
@@ -22,12 +21,6 @@ def test_the_median_of_a_fake_clock_that_waits_for_the_device_on_both_sides(monk
     monkeypatch.setattr(timing_module.time, "perf_counter", lambda: events.append("clock") or now[0])
     assert median_ms(work, device="cuda", warmup=2, repeats=5) == pytest.approx(30)
     assert events == ["work"] * 2 + ["wait", "clock", "work", "wait", "clock"] * 5
-
-
-@pytest.mark.parametrize("wrong", [{"warmup": -1}, {"repeats": 0}])
-def test_impossible_options(wrong):
-    with pytest.raises(ConfigError):
-        median_ms(lambda: None, device="cpu", **wrong)
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="compares with Linux's own number")
