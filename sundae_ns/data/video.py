@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from sundae_ns.core.errors import DataError, regular, writing
+from sundae_ns.core.errors import DataError, reading, regular, writing
 from sundae_ns.data.images import HIGH_RANGE, JPEG, to_srgb_values
 from sundae_ns.data.photos import LEAST_PHOTOS, check_shape
 
@@ -78,7 +78,7 @@ def image_of(frame: Any, path: Path) -> Image.Image:
     for data in frame.side_data:
         if data.type.name == "DISPLAYMATRIX":  # of points (x, y) as rows, in 65536ths
             a, b, _, c, d = np.sign(np.round(np.frombuffer(bytes(data), np.int32)[:5] / 65536)).astype(int)
-            if (a == 0) != (b == 0):  # a right angle
+            if (a == 0) != (b == 0) and abs(a + c) == abs(b + d) == 1:  # a right angle
                 pixels = (pixels.swapaxes(0, 1) if a == 0 else pixels)[:: b + d, :: a + c]
     return Image.fromarray(np.ascontiguousarray(pixels))
 
@@ -88,18 +88,17 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     """The container and its video."""
     import av
 
-    try:
-        with av.open(str(regular(path).absolute()), options=_OPTIONS) as container:
+    with reading(path, "a video that FFmpeg decodes", remedy=_CONVERT, missing=_CONVERT):
+        # Titles of old files are not in UTF-8.
+        with av.open(str(regular(path).absolute()), options=_OPTIONS, metadata_errors="replace") as container:
             video: Any = container.streams.best("video")
-            if video is None:
-                raise DataError(f"{path} has no images; give a video")
+            if video is None or video.codec_context is None:
+                raise DataError(f"{path} has no images that can be decoded; {_CONVERT}")
             if video.codec_context.codec_tag in _DOLBY and video.codec_context.color_trc in _UNSTATED:
                 raise DataError(f"{path} has colours of Dolby Vision alone, which are not read; convert it to BT.709")
             video.thread_type = "AUTO"
             video.codec_context.options = {"max_pixels": str(1 << 27)}
             yield container, video
-    except (av.error.FFmpegError, OSError) as error:
-        raise DataError(f"{path} is not a video that FFmpeg decodes ({error.strerror}); {_CONVERT}") from error
 
 
 def _frames(path: Path) -> Iterator[Any]:

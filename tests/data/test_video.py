@@ -1,6 +1,7 @@
 """Frames of videos: the sharpest of each stretch, in the colours that the file states, or one line on why not."""
 
 import os
+import struct
 
 import av
 import numpy as np
@@ -22,10 +23,22 @@ def patches(width=192, height=64):
 
 
 def write_colours(
-    path, images, matrix=2, full=False, *, pixels="yuv420p", codec="libx264", transfer=2, turn=None, tag=None, flags=0
+    path,
+    images,
+    matrix=2,
+    full=False,
+    *,
+    pixels="yuv420p",
+    codec="libx264",
+    transfer=2,
+    turn=None,
+    tag=None,
+    flags=0,
+    title="",
 ):
     """Write a video of images, which are converted and marked by a matrix, a range and a transfer."""
     with av.open(str(path), "w") as container:
+        container.metadata["title"] = title
         video = container.add_stream(codec, rate=10)
         video.height, video.width = images[0].shape[:2]
         video.pix_fmt = pixels
@@ -171,6 +184,32 @@ def sound(path):
         container.mux(track.encode())
 
 
+def replaced(old, new, **options):
+    """Other bytes in a video whose title is ``a title``."""
+
+    def make(path):
+        write_colours(path, 5 * [patches()], 1, pixels="yuv444p", title="a title", **options)
+        content = path.read_bytes()
+        assert content.count(old)
+        path.write_bytes(content.replace(old, new))
+
+    return make
+
+
+def test_a_damaged_turn_is_none(tmp_path):
+    turn = replaced(
+        struct.pack(">5i", -65536, 0, 0, 0, -65536), struct.pack(">5i", -65536, 0, 0, 0, 0), turn=(180, False)
+    )
+    turn(tmp_path / "a.mp4")
+    assert len(frames_from(tmp_path / "a.mp4")) == 5
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".avi"])
+def test_a_title_in_another_encoding_than_utf_8(tmp_path, suffix):
+    replaced(b"a title", b"\xe4 title")(tmp_path / f"a{suffix}")
+    assert len(frames_from(tmp_path / f"a{suffix}")) == 5
+
+
 def playlist(text):
     """A text that names a video beside it."""
 
@@ -188,6 +227,7 @@ REFUSED = {
     "half": (half, UNREADABLE),
     "a pipe": (os.mkfifo, "it is a pipe or a device"),
     "sound": (sound, "has no images"),
+    "an unknown codec": (replaced(b"avc1", b"zzzz"), "has no images that can be decoded; convert it"),
     "two frames": (lambda path: write_video(path, 2), "has 2 frames, and camera poses need 3 or more"),
     "narrow": (lambda path: write_video(path, 5, (4000, 16)), "is 4000 x 16 px, too narrow for camera poses"),
     "HLS": (playlist("#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nfile://{}\n#EXT-X-ENDLIST\n"), UNREADABLE),

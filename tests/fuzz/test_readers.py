@@ -24,9 +24,17 @@ from hypothesis import HealthCheck, given, settings
 from limits import refused, verdict
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from packed_scenes import full_scene, header_and_body, resealed, resection, sealed
+from photos import photo
+from PIL import Image
+from run_commands import write_video
 from small_captures import meta_of
 
+import sundae_ns as sn
 from sundae_ns.core.errors import PackError, SundaeError
+from sundae_ns.core.gaussians import Gaussians
+from sundae_ns.data.images import reads_heif
+from sundae_ns.data.photos import photo_of, upright
+from sundae_ns.data.video import check_video, write_frames
 from sundae_ns.io import checkpoint
 from sundae_ns.io.formats import read_gaussian_file, read_gaussians, write_for_viewers, write_levels
 from sundae_ns.io.pack import container
@@ -62,6 +70,35 @@ def write_lod(path):
     Path(shutil.make_archive(str(path), "zip", path.parent / "lod")).rename(path)
 
 
+def write_html(path):
+    sn.save(sn.Scene(Gaussians(small_field(20))), path)
+
+
+def write_path(path):
+    row = {"camera_to_world": [float(i % 5 == 0) for i in range(16)], "fov": 50}
+    path.write_text(json.dumps({"camera_path": [row] * 3, "render_width": 64, "render_height": 48, "fps": 24}))
+
+
+def write_photo(path):
+    assert reads_heif()
+    photo(path, image=Image.fromarray(np.arange(3072, dtype=np.uint8).reshape(32, 32, 3)), orientation=6, focal=5.0)
+
+
+def read_photo(path):
+    upright(photo_of(path))
+
+
+def write_clip(path):
+    write_video(path, 9)
+    read_video(path)  # its threads reserve addresses once
+
+
+def read_video(path):
+    check_video(path)
+    shutil.rmtree(path.with_suffix(""), ignore_errors=True)
+    write_frames(path, path.with_suffix(""), 3, lambda _: None)
+
+
 WRITERS = FOREIGN | dict.fromkeys(("a.spz", "a.sog", "a.glb"), write_for_viewers)
 READERS = {
     **{name: (lambda path, write=write: write(path, FIELD), read_gaussian_file) for name, write in WRITERS.items()},
@@ -73,6 +110,10 @@ READERS = {
     "text.ply": (lambda path: write_cloud(path, text=True), read_cloud),
     "a.ckpt": (lambda path: write_checkpoint(path, small_field(20)), read_gaussians),
     "a.sundae": (lambda path: write_scene(path, SCENE), unpack),
+    "page.html": (write_html, sn.load),
+    "path.json": (write_path, sn.cameras_of),
+    **{f"0.{kind}": (write_photo, read_photo) for kind in ("jpg", "png", "tif", "webp", "bmp", "heic")},
+    **{f"a.{kind}": (write_clip, read_video) for kind in ("mp4", "mkv", "avi")},
 }
 """Files by their names: a writer, and the reader that must survive them."""
 many = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
