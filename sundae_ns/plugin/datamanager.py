@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import random
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -96,16 +97,14 @@ class CheckedDataset(InputDataset):
 
 
 class NoTestViews:
-    """In place of the cameras of a test set without images: what needs test views reads them, and fails in one line."""
+    """In place of the cameras of a test set that is too small: what needs them reads them, and fails in one line."""
 
     def __init__(self, capture: Path) -> None:
         self._capture = capture
 
     def __getattr__(self, name: str) -> Any:
-        raise DataError(
-            f"{self._capture} has no test views to measure or render; give ns-render --pose-source train or --split "
-            "train, or train with a --train-split-fraction below 1"
-        )
+        remedy = "ns-render --pose-source train or --split train, or train with a --train-split-fraction below 1"
+        raise DataError(f"{self._capture} has too few test views to measure or render; give {remedy}")
 
     def __len__(self) -> int:
         return int(self.__getattr__("len"))
@@ -184,8 +183,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
     def create_eval_dataset(self) -> CheckedDataset:
         """Test set."""
         dataset = super().create_eval_dataset()
-        if names := dataset.image_filenames:
-            check_tests(self.train_dataparser_outputs.cameras, dataset.cameras, names)
+        if len(dataset) > (sys.argv[1:2] == ["interpolate"]):  # ns-render needs two for a path between them
+            check_tests(self.train_dataparser_outputs.cameras, dataset.cameras, dataset.image_filenames)
         else:
             dataset.cameras = cast(Any, NoTestViews(self.config.capture))
         return dataset

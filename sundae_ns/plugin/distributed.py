@@ -32,7 +32,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.distributed.nn.functional import all_to_all_single
 
-from sundae_ns.core.camera import Camera, camera_center
+from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import NOTHING_SAVED, ConfigError, passed_on
 from sundae_ns.core.gaussians import FEATURES, Gaussians
 from sundae_ns.core.surgery import change_parameter, per_gaussian
@@ -132,7 +132,7 @@ class ShardedSource(GaussianSource):
         numbers = torch.stack([sent, received, sizes[:, 2].long()])
         self._sent, self._received, self.sizes = numbers.tolist()  # waits for the GPU, once a step
         receiver, self._rows = torch.nonzero_static(seen, size=sum(self._sent)).unbind(dim=1)
-        return torch.stack([camera_center(viewmat) for viewmat in viewmats]), receiver
+        return torch.stack([-viewmat[:3, :3].T @ viewmat[:3, 3] for viewmat in viewmats]), receiver
 
     @torch.no_grad()
     def count_views(self, state: TrainingState, *, absgrad: bool) -> None:

@@ -3,6 +3,7 @@
 import math
 import re
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -289,5 +290,14 @@ def test_what_needs_test_views_says_so(capture, load, edit):
         lambda: made.eval_dataset.cameras.fx[0],
         lambda: FixedIndicesEvalDataloader(input_dataset=made.eval_dataset, device="cpu"),
     ):
-        with pytest.raises(DataError, match="has no test views to measure or render; give ns-render --pose-source"):
+        with pytest.raises(DataError, match="too few test views to measure or render; give ns-render --pose-source"):
             needed()
+
+
+def test_a_path_between_test_views_needs_two(capture, load, edit, monkeypatch):
+    first = meta_of(capture)["test_filenames"][:1]
+    edit(capture, val_filenames=first, test_filenames=first)
+    for words, few in ((["dataset"], False), (["interpolate"], True)):
+        monkeypatch.setattr("sys.argv", ["ns-render", *words])
+        with pytest.raises(DataError, match="too few test views") if few else nullcontext():
+            assert len(load(capture).eval_dataset.cameras) == 1
