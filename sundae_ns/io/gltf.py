@@ -41,7 +41,7 @@ from sundae_ns.io.spz import decoded
 EXTENSION = "KHR_gaussian_splatting"
 _SPZ = EXTENSION + "_compression_spz_2"
 _INSTANCING, _VISIBILITY = "EXT_mesh_gpu_instancing", "KHR_node_visibility"
-_KNOWN = {EXTENSION, _SPZ, _INSTANCING, _VISIBILITY, "KHR_mesh_quantization"}
+_KNOWN = {EXTENSION, _SPZ, _INSTANCING, _VISIBILITY, "KHR_mesh_quantization", "glTF 2.0"}
 _SRGB = "srgb_rec709_display"
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
@@ -121,7 +121,7 @@ def read_glb(path: Path) -> tuple[dict[str, Tensor], Marks]:
     with reading(path, "a complete .glb with Gaussians", remedy="export it again, or as .ply"):
         try:
             document, binary = _chunks(path)
-            for name in document.get("extensionsRequired", []):
+            for name in (*document.get("extensionsRequired", []), f"glTF {document['asset'].get('minVersion', 2.0)}"):
                 if name not in _KNOWN:
                     raise ValueError(f"it requires {name}, which is not known here")
             stated = [document["asset"].get("extras", {}).get(_OURS, {}).get(name) for name in _MARKS]
@@ -173,13 +173,13 @@ def _primitives(document: Json, binary: memoryview) -> Iterator[tuple[Json, Tran
                 shown.append((nodes[index], parent))
 
     if "scenes" in document:
-        visit(document["scenes"][document.get("scene", 0)].get("nodes", []), -1)
+        visit(document["scenes"][_index(document.get("scene", 0))].get("nodes", []), -1)
     else:
         below = {index for node in nodes for index in node.get("children", [])}
         visit([index for index in range(len(nodes)) if index not in below], -1)
     for i, (node, _) in enumerate(shown):
         visit(node.get("children", []), i)
-    transforms = _below_parents([node for node, _ in shown])
+    transforms = _below_parents([node for node, _ in shown]) if shown else np.empty((0, 4, 4))
     by_mesh: dict[int, list[Transforms]] = {}
     instances = 0
     for i, (node, parent) in enumerate(shown):

@@ -81,8 +81,7 @@ def prunes_of(run: Path) -> list[dict[str, Any]]:
         records = json.loads(regular(run / PRUNES).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return []
-    is_list = isinstance(records, list) and all(isinstance(record, dict) for record in records)
-    return records if is_list else []
+    return records if isinstance(records, list) and all(isinstance(record, dict) for record in records) else []
 
 
 def prunes_before(path: Path, step: int) -> list[dict[str, Any]]:

@@ -49,7 +49,7 @@ from sundae_ns.core.errors import DataError, reading, regular
 from sundae_ns.core.files import replacing, write_files, write_text
 from sundae_ns.io.budget import afford, afford_gaussians, parsed_json, read_exactly
 from sundae_ns.io.coordinates import scene_order
-from sundae_ns.io.ply import UNMARKED, Marks, check_gaussians, checked, from_smallest_three, vector
+from sundae_ns.io.ply import ANTIALIASED, UNMARKED, Marks, check_gaussians, checked, from_smallest_three, vector
 
 META, STREAMED = METAS = ("meta.json", "lod-meta.json")
 MAX_PALETTE = 1 << 16  # palette rows that two bytes can index
@@ -196,7 +196,7 @@ def _scene(path: Path, entry: Entry, size: int) -> tuple[dict[str, Tensor], Mark
     if (version := meta.get("version", 1)) != 2:
         raise DataError(f"{path} has version {version} of the format; convert it with splat-transform to version 2")
     up, offset = (vector(" ".join(map(str, meta.get(name, ())))) for name in ("up", "offset"))
-    antialiased = bool(meta.get("antialias")) or meta.get("model") == "antialiased"
+    antialiased = any(str(meta.get(name)).lower() in ANTIALIASED for name in ("antialias", "model"))
     return _decoded(entry, meta, size), Marks(antialiased, up=up, offset=offset)
 
 
@@ -239,10 +239,10 @@ def _file_entry(folder: Path, name: str) -> bytes:
 
 def _bundled(bundle: zipfile.ZipFile, size: int, *, inner: bool = False) -> tuple[Entry, bool]:
     """What reads an entry of a zip, whose files may be in a folder or in another zip; and whether it is streamed."""
-    names = {name: PurePosixPath(name).name for name in bundle.namelist()}
+    names = {name: PurePosixPath(name.replace("\\", "/")).name for name in bundle.namelist()}  # some are of Windows
     streamed = STREAMED in names.values()
     found = [name for name, last in names.items() if last == (STREAMED if streamed else META)]
-    scenes = [name for name, last in names.items() if last.endswith(".sog") and not last.startswith(".")]
+    scenes = [name for name, last in names.items() if last.lower().endswith(".sog") and not last.startswith(".")]
     if len(scenes) == 1 and not found and not inner:
         return _bundled(zipfile.ZipFile(io.BytesIO(_zip_entry(bundle, size, "", scenes[0]))), size, inner=True)
     if len(found) != 1:

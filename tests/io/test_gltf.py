@@ -196,6 +196,9 @@ HOSTILE = {
     "another kernel": ({f"{SPLAT}/kernel": "box"}, "of another kernel"),
     "compressed": ({f"{SPLAT}/extensions": {"KHR_gaussian_splatting_compression_spz": {}}}, "compression_spz"),
     "no SPZ": ({f"{SPLAT}/extensions": {SPZ_2: {"bufferView": 0}}}, "missing|header"),
+    "a later version": ({"asset/minVersion": "2.1"}, "it requires glTF 2.1"),
+    "a negative scene": ({"scene": -1}, "-1 is no index"),
+    "nothing shown": ({"nodes": [{"children": [1], **HIDDEN}, {"mesh": 0}]}, "no mesh of its scene has"),
     "an unknown requirement": ({"extensionsRequired": ["KHR_new"]}, "it requires KHR_new"),
     "a node twice a child": ({"nodes": [{"children": [1, 1]}, {}]}, "two parents"),
     "children without end": ({"nodes/0/children": [0] * 30_000}, "two parents"),
@@ -220,7 +223,7 @@ HOSTILE = {
     "unknown numbers": ({"accessors/0/componentType": 1}, "not that of a glTF scene"),
     "matrices": ({"accessors/0/type": "MAT4"}, "not that of a glTF scene"),
     "no scene": ({"scenes": []}, "not that of a glTF scene"),
-    "a scene of words": ({"scene": "x"}, "not that of a glTF scene"),
+    "a scene of words": ({"scene": "x"}, "'x' is no index"),
     "extras of words": ({"asset/extras": "x"}, "not that of a glTF scene"),
 }
 TEXTS = {

@@ -88,6 +88,8 @@ SAME = {
         b"nx\nproperty float ny\nproperty float nz", b"red\nproperty float green\nproperty float blue"
     ),
     "other letters": _header(b"element", COMMENT),
+    "capital letters": _header(b"x\nproperty float y\nproperty float z", b"X\nproperty FLOAT Y\nproperty Float Z"),
+    "spaces at the ends of lines": _header(b"element", b"element", b" \n"),
     "lines of DOS": _header(b"element", COMMENT, b"\r\n"),
     "lines of old Macs": _header(b"element", COMMENT, b"\r"),
 }
@@ -103,12 +105,13 @@ def test_other_forms_are_the_same_gaussians(tmp_path, form):
     assert torch.equal(read_point_cloud(path)[0], params["means"])
 
 
-def test_the_filter_of_mip_splatting_is_fused_and_never_stale(tmp_path):
+@pytest.mark.parametrize("name", ["filter_3D", "filter_3d"])
+def test_the_filter_of_mip_splatting_is_fused_and_never_stale(tmp_path, name):
     """As its ``get_scaling_with_3D_filter`` and ``get_opacity_with_3D_filter``."""
     params, path, n = small_field(9), tmp_path / "a.ply", 9
     write_ply(path, params)
     widths = np.linspace(0, 0.3, n, dtype=np.float32)
-    write_columns(path, {**columns_of(path), "filter_3D": widths})
+    write_columns(path, {**columns_of(path), name: widths})
     read = read_ply(path)
     before, width = params["scales"].exp().square(), torch.from_numpy(widths)[:, None].square()
     torch.testing.assert_close(read["scales"].exp(), (before + width).sqrt(), rtol=1e-6, atol=0)
@@ -118,10 +121,10 @@ def test_the_filter_of_mip_splatting_is_fused_and_never_stale(tmp_path):
     mask = torch.arange(n) > 4
     keep_vertices(path, tmp_path / "copied.ply", mask)
     keep_vertices(path, tmp_path / "merged.ply", mask, {name: value[mask] for name, value in read.items()})
-    for name in ("copied.ply", "merged.ply"):
-        for key, value in read_ply(tmp_path / name).items():
+    for copy in ("copied.ply", "merged.ply"):
+        for key, value in read_ply(tmp_path / copy).items():
             torch.testing.assert_close(value, read[key][mask], rtol=1e-6, atol=1e-6)
-    assert columns_of(tmp_path / "merged.ply")["filter_3D"].tolist() == [0] * 4
+    assert columns_of(tmp_path / "merged.ply")[name].tolist() == [0] * 4
 
 
 def test_2dgs_is_flat_and_opacities_of_bytes_are_shares(tmp_path):
@@ -137,6 +140,10 @@ def test_2dgs_is_flat_and_opacities_of_bytes_are_shares(tmp_path):
     torch.testing.assert_close(opacities, torch.tensor([0, 0.2, 0.4, 0.8, 1]), atol=2e-6, rtol=0)
 
 
+ANTIALIASED = (
+    "anti-aliased = on|AntiAliasing: 1.0|antialias: yes|Antialiased|rasterize_mode mip|train_flags --antialiasing"
+)
+UPWARDS = "up: 0 0 2|upAxis=Z|Up vector [0, 0, 1]|UP_DIRECTION (0; 0; 1)|vertical axis: z-up|Vertical Axis: z"
 ALL_MARKS = Marks(True, True, (0.6, 0.0, 0.8), (1e6 / 3, 0.1, -4e6))
 
 
@@ -146,14 +153,16 @@ ALL_MARKS = Marks(True, True, (0.6, 0.0, 0.8), (1e6 / 3, 0.1, -4e6))
         (["SplatRenderMode: mip"], Marks(antialiased=True)),
         (["  SPLATRENDERMODE:  MIP  "], Marks(antialiased=True)),
         (["antialiased 1"], Marks(antialiased=True)),
-        (["train_flags antialiasing"], Marks(antialiased=True)),
+        *(([mark], Marks(antialiased=True)) for mark in ANTIALIASED.split("|")),
+        (["anti_aliasing: off", "render_mode: classic"], Marks()),
         (["antialiased 1", "SplatRenderMode: default"], Marks()),
         (["SplatRenderMode: default", "Antialiased 1"], Marks(antialiased=True)),
         (["antialiased 0", "SplatRenderMode: 2dgs", "antialiased edges are nice"], Marks()),
         (["Vertical axis: 0 -2 0"], Marks(up=(0.0, -1.0, 0.0))),
         (["vertical AXIS: 3, 0, 4"], Marks(up=(0.6, 0.0, 0.8))),
-        (["Vertical Axis: z"], Marks(up=(0.0, 0.0, 1.0))),
         (["Vertical axis: -y"], Marks(up=(0.0, -1.0, 0.0))),
+        *(([mark], Marks(up=(0.0, 0.0, 1.0))) for mark in UPWARDS.split("|")),
+        (["up to 3 0 0", "Updated: 0 0 1"], Marks()),
         (["Exported from Brush", "Vertical axis: y"], Marks(up=(0.0, -1.0, 0.0))),
         (["Vertical axis: 0 0 0", "Vertical axis of a column", "Offset: nan 0 0"], Marks()),
         (["Vertical axis: up"], Marks()),
@@ -165,6 +174,9 @@ ALL_MARKS = Marks(True, True, (0.6, 0.0, 0.8), (1e6 / 3, 0.1, -4e6))
 )
 def test_marks_of_a_header(tmp_path, comments, marks):
     write_ply(tmp_path / "a.ply", small_field(3), comments=comments)
+    assert ply_marks(tmp_path / "a.ply") == marks
+    content = (tmp_path / "a.ply").read_bytes().replace(b"\ncomment ", b"\nobj_info ")
+    (tmp_path / "a.ply").write_bytes(content)
     assert ply_marks(tmp_path / "a.ply") == marks
 
 
@@ -193,6 +205,7 @@ WRONG = {
     "no vertices": (lambda path: path.write_bytes(b"ply\nformat ascii 1.0\nend_header\n"), "no vertices"),
     "no opacity": (_without("opacity"), "lacks opacity"),
     "no scale": (_without("scale_1", "scale_2"), "lacks scale_1, scale_2"),
+    "Beta Splatting": (_with("beta"), "Gaussians of another kernel .beta."),
     "2DGS without rotations": (_without("scale_2", "rot_0"), "lacks scale_2, rot_0"),
     "Spacetime Gaussians": (_with("trbf_center", "motion_0"), "holds 4D Gaussians"),
     "4D Gaussians with a time": (_with("t"), "holds 4D Gaussians"),

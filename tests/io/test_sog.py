@@ -155,8 +155,9 @@ def bundled(tmp_path_factory):
 
 FORMS = {
     "in a folder": lambda files: zipped({f"garden/{name}": data for name, data in files.items()}),
+    "by Windows": lambda files: zipped({f"garden\\{name}": data for name, data in files.items()}),
     "deflated": lambda files: zipped(files, zipfile.ZIP_DEFLATED),
-    "in a zip": lambda files: zipped({"readme.txt": b"", "__MACOSX/._a.sog": b"", "b/a.sog": zipped(files)}),
+    "in a zip": lambda files: zipped({"readme.txt": b"", "__MACOSX/._a.sog": b"", "b/a.SOG": zipped(files)}),
 }
 
 
@@ -203,6 +204,20 @@ def _meta(**changes):
         return zipped(files | {"meta.json": json.dumps(document).encode()})
 
     return make
+
+
+@pytest.mark.parametrize(
+    ("stated", "marked"),
+    [
+        ({"model": "mip"}, True),
+        ({"antialias": 1}, True),
+        ({"antialias": "false"}, False),
+        ({"model": "default"}, False),
+    ],
+)
+def test_marks_of_antialiasing(tmp_path, bundled, stated, marked):
+    (tmp_path / "a.sog").write_bytes(_meta(**stated)(bundled))
+    assert read_gaussian_file(tmp_path / "a.sog")[1].antialiased == marked
 
 
 def _with(name, content):
