@@ -12,7 +12,7 @@ MEGABYTE = 1e6  # bytes in the MB of tables and plots
 
 
 def _share(words: list[str]) -> float:
-    return float(words[0].rstrip("%")) / (100 if words[0].endswith("%") else 1)
+    return float(words[0].removesuffix("%")) / (100 if words[0].endswith("%") else 1)
 
 
 Share = Annotated[
