@@ -72,14 +72,14 @@ def positions(values: Any, name: str) -> Tensor:
 
 @contextmanager
 def usual_defaults() -> Iterator[None]:
-    """Make new tensors float32 on the CPU in a block or a decorated function, whatever a caller's defaults are."""
+    """Make new tensors float32 on the CPU, for autograd too, in a block or a function, whatever a caller has set."""
     given = torch.empty(0)
-    if given.dtype is torch.float32 and given.device.type == "cpu":
+    if given.dtype is torch.float32 and given.device.type == "cpu" and not given.is_inference():
         yield
         return
     torch.set_default_dtype(torch.float32)
     try:
-        with torch.device("cpu"):
+        with torch.device("cpu"), torch.inference_mode(False):
             yield
     finally:
         torch.set_default_dtype(given.dtype)

@@ -85,6 +85,8 @@ def to_srgb(image: Image.Image) -> Image.Image:
 
     As in browsers, a profile that is damaged or of another kind of pixels counts for nothing.
     """
+    if image.mode not in _MODES:
+        raise DataError(f"an image has pixels of type {image.mode}; convert it to RGB")
     if is_srgb(image):
         return image
     convert, deep = _conversion(image), image.mode.startswith("I;16")

@@ -82,10 +82,9 @@ def left_out(folder: Path) -> str | None:
     if not counts:
         return None
     listed = ", ".join(f"{count} {suffix}" for suffix, count in sorted(counts.items()))
-    remedy = "convert them to JPEG (`magick mogrify -format jpg FILES`, or export them as JPEG)"
-    if counts.keys() <= set(HEIF):
-        remedy = 'install pillow-heif with pip install "sundae_ns[photos]"'
-    return f"{listed} left out; {remedy}"
+    convert = "convert them to JPEG (`magick mogrify -format jpg FILES`, or export them as JPEG)"
+    install = 'install pillow-heif with pip install "sundae_ns[photos]"'
+    return f"{listed} left out; {install if counts.keys() <= set(HEIF) else convert}"
 
 
 def masks_beside(folder: Path) -> Path | None:

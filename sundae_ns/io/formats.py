@@ -50,7 +50,7 @@ def kind_of(path: Path) -> Kind | None:
     try:
         with regular(path).open("rb") as file:
             first = file.read(max(map(len, _FIRST_BYTES)))
-    except OSError:
+    except (OSError, ValueError):
         return None
     kind = next((kind for begin, kind in _FIRST_BYTES.items() if first.startswith(begin)), None)
     if kind not in ("sog", None):

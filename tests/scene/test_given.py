@@ -147,6 +147,8 @@ REFUSED = {
     "seed": (lambda: sn.virtual_cameras(SCENE, 1, seed="a"), "seed is 'a'"),
     "images to 255": (lambda: sn.measure(SCENE, [255.0 * POINTS], [CAMERA]), "image 0 has values from"),
     "CHW": (lambda: sn.measure(SCENE, [image().transpose(2, 0, 1)], [CAMERA]), r"\[20, 24, 3\] and \[3, 20, 24\]"),
+    "a PIL image of floats": (lambda: sn.measure(SCENE, Image.new("F", (24, 20)), CAMERA), "pixels of type F; convert"),
+    "NUL": (lambda: sn.load("a\0.ply"), "cannot be read|not a complete .ply"),
     "no image": (lambda: sn.measure(SCENE, 5, [CAMERA]), "image 0 has values from 5 to 5"),
     "gone": (lambda: sn.measure(SCENE, ["gone.png"], [CAMERA]), "gone.png"),
     "few": (lambda: sn.measure(SCENE, [image()] * 2, [CAMERA]), "2 images do not fit 1 views"),
@@ -176,6 +178,14 @@ def test_what_is_refused_in_one_line(name):
         call()
     assert "\n" not in str(caught.value)
     assert ";" in str(caught.value)
+
+
+@pytest.mark.usefixtures("short_prunes")
+def test_inference_mode_is_that_of_the_caller():
+    with torch.inference_mode():
+        made = sn.Scene.from_points(POINTS, POINTS)
+        assert sn.prune(made, count=50, cameras=CAMERA).num_gaussians == 50
+        assert torch.ones(1).is_inference()
 
 
 def test_the_rule_of_a_prune_is_that_of_the_command():
