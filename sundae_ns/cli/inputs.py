@@ -82,9 +82,10 @@ class Edit(NamedTuple):
         edit, wishes = self, self.wishes
         if self.details.no_head:
             edit = edit._replace(scene=replace(self.scene, head=None))
+        if not wishes.cleans:
+            return edit
         with naming_full_memory(lambda: len(self.rows)):
-            if wishes.cleans:
-                edit = edit._replace(scene=edit.scene.to(fastest_device()))
+            edit = edit._replace(scene=edit.scene.to(fastest_device()))
             if wishes.crop is not None:
                 mask = crop_mask(edit.scene, wishes.crop[:3], wishes.crop[3:])
                 print(f"{int(mask.sum()):,} of {len(mask):,} Gaussians are in the box", file=sys.stderr)
@@ -96,9 +97,6 @@ class Edit(NamedTuple):
                 if not bool(mask.any()):
                     raise DataError("all Gaussians float; leave out --remove-floaters")
                 edit = edit.cut(mask)
-        total, count = len(edit.scene), wishes.count
-        if count is not None and count > total:
-            print(f"warning: the scene has {total:,} Gaussians, fewer than {count:,}; all are kept", file=sys.stderr)
         return edit
 
     def reduced(
@@ -187,6 +185,8 @@ def opened(source: Path, wishes: Wishes, details: SceneDetails, *, capture: bool
         scene, rows = load_with_mask(source)
     scene = with_start(scene, details.start_view, details.up)
     rows = torch.ones(len(scene), dtype=torch.bool) if rows is None else rows
+    if wishes.count is not None and wishes.count > len(scene):
+        print(f"warning: {source} has {len(scene):,} Gaussians, not {wishes.count:,}; all are kept", file=sys.stderr)
     return Edit(source, wishes, details, scene, rows, chosen_cameras(scene, details.cameras, None))
 
 
