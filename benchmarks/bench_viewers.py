@@ -34,8 +34,9 @@ from numpy.typing import NDArray
 
 from harness.chromium import Browser, find_chromium, wait_for
 from sundae_ns.core.gaussians import FEATURES
+from sundae_ns.io.formats import write_levels
 from sundae_ns.io.pack.packed_scene import PackedScene, read_scene
-from sundae_ns.scene.load_save import save_for_viewers, save_levels
+from sundae_ns.scene.load_save import marks_of, save
 from sundae_ns.scene.packing import arrays_of_cameras, scene_of
 
 PAGE = """<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,">
@@ -146,9 +147,10 @@ def opened(scene: PackedScene, kind: str) -> Iterator[Viewers]:
         bundled("viewers.ts", site / "viewers.js", "--minify")
         file = "a/lod-meta.json" if kind == "lod" else f"a.{kind}"
         if kind == "lod":
-            save_levels([scene_of(scene), scene_of(scene)[::10]], site / "a")
+            levels = scene_of(scene), scene_of(scene)[::10]
+            write_levels(site / "a", [level.gaussians for level in levels], marks_of(levels[0]))
         else:
-            save_for_viewers(scene_of(scene), site / file)
+            save(scene_of(scene), site / file)
         with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=site)) as server:
             threading.Thread(target=server.serve_forever, daemon=True).start()
             try:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 import sundae_ns as sn
 from harness.rows import Rows
-from sundae_ns.scene.prune_scene import floater_mask
+from sundae_ns.scene.compose import floater_mask
 from sundae_ns.scene.virtual_cameras import middle_and_reach, usable
 
 PLANTED, HELD_OUT = 100, 12  # floaters of each kind, and cameras

@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from sundae_ns.plugin.distill import distill
     from sundae_ns.pruning.rule import PruneRule
     from sundae_ns.scene.cameras import cameras_of
-    from sundae_ns.scene.compose import merge, transform
+    from sundae_ns.scene.compose import crop, merge, remove_floaters, transform
     from sundae_ns.scene.load_save import load, save
     from sundae_ns.scene.page import page, show
-    from sundae_ns.scene.prune_scene import crop, prune, remove_floaters
+    from sundae_ns.scene.prune_scene import prune
     from sundae_ns.scene.scene import Rendering, Scene, measure, render
     from sundae_ns.scene.virtual_cameras import virtual_cameras
 
@@ -44,10 +44,10 @@ _MODULES = {
     "plugin.distill": "distill",
     "pruning.rule": "PruneRule",
     "scene.cameras": "cameras_of",
-    "scene.compose": "merge transform",
+    "scene.compose": "crop merge remove_floaters transform",
     "scene.load_save": "load save",
     "scene.page": "page show",
-    "scene.prune_scene": "crop prune remove_floaters",
+    "scene.prune_scene": "prune",
     "scene.scene": "Rendering Scene measure render",
     "scene.virtual_cameras": "virtual_cameras",
 }

@@ -12,12 +12,12 @@ from sundae_ns.cli.options import Advanced, File, Flag, Out, Plain, Scene, Scene
 from sundae_ns.cli.refusals import check_file, check_folder, check_suffix
 from sundae_ns.core.errors import ConfigError
 from sundae_ns.core.gaussians import sh_degree
-from sundae_ns.io.formats import FORMATS, kind_of
+from sundae_ns.io.formats import FORMATS, kind_of, write_for_viewers, write_levels
 from sundae_ns.io.run_folder import files_of
 from sundae_ns.io.sog import STREAMED
 from sundae_ns.io.spz import clamped
 from sundae_ns.rasterize.interface import fastest_device
-from sundae_ns.scene.load_save import save_for_viewers, save_levels
+from sundae_ns.scene.load_save import marks_of
 from sundae_ns.scene.page import write_page
 
 
@@ -92,14 +92,14 @@ def export(
             for level, psnr in trained:
                 print(f"{level.num_gaussians:,} Gaussians: {psnr:.2f} dB against the full scene, on cameras of no step")
                 levels.append(level)
-        save_levels(levels, out, upright=upright)
+        write_levels(out, [level.gaussians for level in levels], marks_of(levels[0]), upright=upright)
         print(f"{file}: {levels[0].num_gaussians:,} Gaussians and {len(levels) - 1} levels below")
     elif copies:
         left.write(out)
         print(f"{out}: {left.scene.num_gaussians:,} of {len(left.rows):,} Gaussians")
     else:
         with Console(stderr=True).status(f"Writing {left.scene.num_gaussians:,} Gaussians"):  # a .sog takes minutes
-            written = save_for_viewers(left.stated, out, upright=upright)
+            written = write_for_viewers(out, left.stated.gaussians, marks_of(left.stated), upright=upright)
         mode, degree = ", antialiased" if left.scene.antialiased else "", sh_degree(written["features_rest"])
         print(f"{out}: {len(written['means']):,} Gaussians, degree {degree}{mode}, {out.stat().st_size:,} bytes")
         if suffix == ".spz" and (beyond := clamped(written)):

@@ -16,24 +16,24 @@ from rich.console import Console
 from torch import Tensor
 
 from sundae_ns.cli.options import SceneDetails, Wishes
+from sundae_ns.cli.refusals import check_file
 from sundae_ns.core.camera import Camera
-from sundae_ns.core.errors import DataError, SundaeError
+from sundae_ns.core.errors import ConfigError, DataError, SundaeError
 from sundae_ns.core.tables import MEGABYTE
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.io.config_file import check_run, config_of, find_config
 from sundae_ns.io.formats import UPRIGHT, kind_of
 from sundae_ns.io.pack import container
-from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.io.ply import has_own_columns, keep_vertices
 from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.scene.cameras import cameras_of, with_start
-from sundae_ns.scene.compose import transform
-from sundae_ns.scene.load_save import load, load_with_mask, write_scene
+from sundae_ns.scene.compose import crop_mask, floater_mask, transform
+from sundae_ns.scene.describe import write_preview
+from sundae_ns.scene.load_save import load, load_with_mask, save
 from sundae_ns.scene.page import packed_of
-from sundae_ns.scene.prune_scene import PrunedScene, count_for_drop, crop_mask, floater_mask, prune_with_mask, within
-from sundae_ns.scene.scene import Scene
-from sundae_ns.scene.sizes import Form, forms_of, prune_to_bytes, stated
+from sundae_ns.scene.prune_scene import Form, PrunedScene, count_for_drop, prune_to_bytes, prune_with_mask
+from sundae_ns.scene.scene import Scene, within
 from sundae_ns.scene.virtual_cameras import VIEWS, virtual_cameras
 
 
@@ -46,19 +46,13 @@ class Edit(NamedTuple):
     scene: Scene
     rows: Tensor  # True for the Gaussians of the file that are left, bool [N]
     cameras: Sequence[Camera]  # those given or stored; of a pruned scene, those that decided
-    form: Form | None = None  # of a file of a given size
+    form: Form = Form()  # of a file of a given size
     pruned: PrunedScene | None = None
 
     @property
     def stated(self) -> Scene:
         """The scene, on the CPU, as its form states it."""
-        scene = self.scene.to("cpu")
-        return scene if self.form is None else stated(scene, self.form)
-
-    @property
-    def precision(self) -> PackConfig | None:
-        """That of a packed file; None for the default."""
-        return None if self.form is None else self.form.precision
+        return self.form.of(self.scene.to("cpu"))
 
     def copies_rows(self, out: Path) -> bool:
         """Whether a .ply keeps the rows, properties and comments of another one."""
@@ -70,7 +64,7 @@ class Edit(NamedTuple):
             moved = self.pruned is not None and self.pruned.moved
             keep_vertices(self.source, out, self.rows, self.stated.gaussians if moved else None)
         else:
-            write_scene(self.stated, out, config=self.precision)
+            save(self.stated, out, config=self.form.precision)
         return out.stat().st_size
 
     def cut(self, mask: Tensor) -> Edit:
@@ -96,6 +90,8 @@ class Edit(NamedTuple):
                 print(f"removed {int((~mask).sum()):,} floaters of {len(mask):,} Gaussians{why}", file=sys.stderr)
                 if not bool(mask.any()):
                     raise DataError("all Gaussians float; leave out --remove-floaters")
+                if self.details.preview is not None:
+                    write_preview(self.details.preview, edit.scene, edit.scene[mask], edit.cameras)
                 edit = edit.cut(mask)
         return edit
 
@@ -125,14 +121,14 @@ class Edit(NamedTuple):
                 for number, psnr in curve:
                     print(f"{number:12,} Gaussians: {psnr:.2f} dB against the full scene, on held-out cameras")
 
-            def after(pruned: PrunedScene, form: Form | None = None) -> Edit:
+            def after(pruned: PrunedScene, form: Form = edit.form) -> Edit:
                 rows = within(edit.rows, pruned.mask.cpu())
                 return edit._replace(scene=pruned.scene, rows=rows, form=form, cameras=cameras, pruned=pruned)
 
             if wishes.max_mb is None:
                 return after(prune_with_mask(scene, wishes.keep, count, cameras, rule, progress=True))
             # All columns of a .ply stay.
-            forms = forms_of(scene, out.suffix.lower())[: 1 if self.copies_rows(out) or not rounds else None]
+            forms = Form.choices(scene, out.suffix.lower())[: 1 if self.copies_rows(out) or not rounds else None]
 
             def write(pruned: PrunedScene, form: Form, folder: Path) -> int:
                 return after(pruned, form).write(folder / out.name)
@@ -146,7 +142,7 @@ class Edit(NamedTuple):
         if is_run(self.source):  # its file is CAPTURE/METHOD/TIME/config.yml
             name = config_of(self.source).resolve().parents[2].name
         if kind_of(self.source) != "packed" or self.wishes.cleans or self.wishes.reduces or details.no_head:
-            return name, left.stated, packed_of(left.stated, left.precision)
+            return name, left.stated, packed_of(left.stated, left.form.precision)
         packed = self.source.read_bytes()
         if details.start_view is not None or details.up is not None:
             from sundae_ns.scene.packing import stated_start  # its encoder needs a compiler, which other files do not
@@ -175,10 +171,11 @@ class Edit(NamedTuple):
 
 
 def opened(source: Path, wishes: Wishes, details: SceneDetails, *, capture: bool = False, most: int = 100) -> Edit:
-    """A scene before its wishes, upright and started as its details say.
-
-    ``capture`` asks for cameras of the capture of a run, at ``most`` so many.
-    """
+    """A scene before its wishes, upright and started by its details; ``capture`` asks for ``most`` cameras of a run."""
+    if details.preview is not None:
+        if wishes.remove_floaters is None:
+            raise ConfigError("--preview shows what --remove-floaters changes; add it")
+        check_file(details.preview, reads=[source, details.cameras], overwrite=details.overwrite)
     if is_run(source) and (capture or wishes.remove_floaters is not None or details.data is not None):
         scene, rows = open_run(source, max_cameras=most, data=details.data), None
     else:

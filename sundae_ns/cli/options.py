@@ -93,6 +93,8 @@ class SceneDetails(Details):
     place of those of the scene, or of virtual ones."""
     data: File = None
     """folder of the capture of a run, if it moved."""
+    preview: File = None
+    """PNG to write: what the camera that --remove-floaters changes most sees before and after."""
     overwrite: Overwrite = False
 
 

@@ -104,7 +104,7 @@ def pack(
                 print("the fine-tune loses too much for the target; packed without it, try more steps", file=sys.stderr)
             packs = [(best.scene, best.codecs)]  # both are compared already
         else:
-            packs.append(fit_scene(source, left.precision))
+            packs.append(fit_scene(source, left.form.precision))
         report = write_fitted(out, *packs[0])
         bar.update(task, advance=1, description="Measuring")
         if kind is None and wishes.crop is None:  # photos show what a box leaves out

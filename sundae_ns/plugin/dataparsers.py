@@ -380,11 +380,10 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
         warn("all cameras stand at one place, so nothing says how far things are; check the poses")
         return
     usual = distances.median()
-    cloud = None if points is None or not len(points) else points.double().cpu()
-    far = torch.from_numpy(stray_cameras(centres.double().numpy(), lambda: None if cloud is None else cloud.numpy()))
-    if not far.any() and usual > 0:
-        reach = 0.0 if cloud is None else float((cloud - middle).norm(dim=1).median())
-        far = (distances > 20 * usual) & (distances > STRAY * reach)
+    cloud = centres[:0] if points is None else points.cpu()
+    far = torch.from_numpy(stray_cameras(centres.double().numpy(), lambda: cloud.double().numpy()))
+    if not far.any() and usual > 0 and (far := distances > 20 * usual).any() and len(cloud):
+        far &= distances > STRAY * float((cloud.double() - middle).norm(dim=1).median())
     if far.any():
         times = f"{float(distances[_first(far)] / usual):,.0f} times as far away as most"
         which = f"{names[_first(far)].name} is {times if usual > 0 else 'far from all others'}"

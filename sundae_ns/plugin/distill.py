@@ -17,20 +17,18 @@ from pytorch_msssim import SSIM
 from torch.nn import Parameter
 
 from sundae_ns.core.camera import Camera
-from sundae_ns.core.errors import CheckpointError, ConfigError, reading
+from sundae_ns.core.errors import CheckpointError, reading
 from sundae_ns.core.files import replacing
 from sundae_ns.core.gaussians import FEATURES, Gaussians, sanitise
-from sundae_ns.core.values import usual_defaults
+from sundae_ns.core.values import usual_defaults, whole
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.head.head import CompensationHead, HeadConfig, stored_bytes
 from sundae_ns.plugin.model import SundaeModelConfig
-from sundae_ns.plugin.optimizer_configs import RATES
-from sundae_ns.scene.initialization import initial_features
-from sundae_ns.scene.optimise import optimise, rate_factor
+from sundae_ns.plugin.optimizer_configs import RATES, optimise, rate_factor
 from sundae_ns.scene.prune_scene import prune_with_mask
 from sundae_ns.scene.render import GaussianSource
-from sundae_ns.scene.scene import Scene, measure, render
-from sundae_ns.scene.virtual_cameras import VIEWS, by_device, of_unit_size, resized, size_of, split, virtual_cameras
+from sundae_ns.scene.scene import Scene, initial_features, measure, render
+from sundae_ns.scene.virtual_cameras import VIEWS, by_device, of_unit_size, resized, split, virtual_cameras
 from sundae_ns.train.averaging import AVERAGED_EVERY, RunningMean, weights_of
 from sundae_ns.train.choice import least_gain
 from sundae_ns.train.graphed_step import RecordedStep
@@ -65,9 +63,7 @@ class Distillation:
         size: int | None = None,
         progress: bool = False,
     ) -> None:
-        steps = by_device(STEPS, teacher.device) if steps is None else steps
-        if steps < 1:
-            raise ConfigError(f"steps is {steps}; give 1 or more")
+        steps = whole(by_device(STEPS, teacher.device) if steps is None else steps, "steps")
         if keep is None and count is None:
             keep = 0.1
         # Its own head, if it has one, corrects its images.
@@ -79,9 +75,7 @@ class Distillation:
         else:
             trained = virtual_cameras(teacher, CAMERAS, seed=seed, size=side)
             held_out = virtual_cameras(teacher, HELD_OUT, seed=seed + 1, size=side)
-        self._size = size_of(teacher)
-        self._teacher, scaled = of_unit_size(teacher, [*trained, *held_out])
-        scaled = [camera.to(teacher.device) for camera in scaled]
+        self._teacher, scaled, self._size = of_unit_size(teacher, [*trained, *held_out])
         self.cameras, self.held_out = scaled[: len(trained)], scaled[len(trained) :][:HELD_OUT]
         self.steps, self._seed = steps, seed  # Number of steps to train
         scored_by = self.cameras[: by_device(VIEWS, teacher.device)]
@@ -157,7 +151,11 @@ class Distillation:
                 return sparse * 0.01 ** (i / steps)
             return rate_factor(i, steps) if name == "compensation" else 1.0
 
-        return optimise(self._train_step, self.state.optimizers, steps, factor, first=first, on_step=on_step)
+        for i in optimise(self.state.optimizers, steps, factor, first):
+            self._train_step(i)
+            if on_step(i + 1) is False:
+                return False
+        return True
 
     def _try_head(self, steps: int, on_step: Callable[[int], object]) -> bool:
         """Train without and with the head from the same start, and keep the head if it pays; False if interrupted."""
@@ -223,7 +221,7 @@ class Distillation:
 
     def result(self) -> Scene:
         """The scene as it is now, in the coordinates of the full one."""
-        return resized(self.scene(), self._size)
+        return dataclasses.replace(scene := self.scene(), gaussians=resized(scene.gaussians, self._size))
 
     def save(self, path: Path) -> None:
         """Write what a resumed training needs, atomically."""
@@ -309,8 +307,7 @@ def levels_of(
     side, plain = by_device(SIDES, scene.device), dataclasses.replace(scene, head=None)
     cameras = [camera.zoomed(min(1.0, side / max(camera.width, camera.height))) for camera in cameras]
     cameras = cameras or virtual_cameras(plain, CAMERAS, size=side)
-    steps = by_device(LEVEL_STEPS, scene.device)
     for share in LEVELS:
-        made = Distillation(plain, keep=share, cameras=cameras, steps=steps, head=False)
+        made = Distillation(plain, keep=share, cameras=cameras, steps=by_device(LEVEL_STEPS, scene.device), head=False)
         made.train(after_step)
         yield made.result(), made.quality()

@@ -36,7 +36,7 @@ from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import NOTHING_SAVED, ConfigError, passed_on
 from sundae_ns.core.gaussians import FEATURES, Gaussians
 from sundae_ns.core.surgery import change_parameter, per_gaussian
-from sundae_ns.scene.render import ColorSettings, GaussianSource, colors_from, may_be_seen
+from sundae_ns.scene.render import GaussianSource, RenderSettings, colors_from, may_be_seen
 from sundae_ns.train.densification import COUNTED, start_counting
 from sundae_ns.train.exposure import ExposureCompensation
 from sundae_ns.train.state import Callback, TrainingState
@@ -99,9 +99,7 @@ class ShardedSource(GaussianSource):
         """Number of Gaussians of all ranks, as of the last step."""
         return sum(self.sizes)
 
-    def primitives(
-        self, camera: Camera, settings: ColorSettings, *, features: bool, colors: bool = True
-    ) -> dict[str, Tensor]:
+    def primitives(self, camera: Camera, settings: RenderSettings, *, features: bool) -> dict[str, Tensor]:
         """The Gaussians of all ranks that the camera of this rank may see; differentiable. Collective."""
         gaussians, names = self.gaussians, ["means", "quats", "scales", "opacities", *([FEATURES] if features else [])]
         centers, ranks = self._route(camera)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, MutableMapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -37,13 +37,12 @@ from sundae_ns.plugin.distributed import Ranks
 from sundae_ns.plugin.viewer import ViewerControls, in_viewer
 from sundae_ns.rasterize.interface import select_backend
 from sundae_ns.rasterize.types import Backend
-from sundae_ns.scene.frames import FrameReplay, Later, LazyOutputs, ShownResponse, empty_outputs, late_outputs
+from sundae_ns.scene.frames import FrameReplay, LazyOutputs, ShownResponse, empty_outputs, late_outputs
 from sundae_ns.scene.render import (
     SHOWN_BACKGROUNDS,
     GaussianSource,
     RenderSettings,
     StepResolution,
-    TrainingCamera,
     contribution,
     render_view,
 )
@@ -239,7 +238,6 @@ class SundaeModel(SplatfactoModel):
         self.state.info = splatted.info
         for callback in self.train_callbacks:
             callback.before_backward(self.state)
-        del images["feature_image"]
         return {**images, "background": background, "window": crop}
 
     def _shown_outputs(self, ns_camera: Cameras) -> MutableMapping[str, Any]:
@@ -249,7 +247,7 @@ class SundaeModel(SplatfactoModel):
         if visible is None:
             return empty_outputs(camera.width, camera.height, background)
         settings = self.render_settings(training=False)
-        compensated = settings if visible.compensate else settings.without_head()
+        compensated = settings if visible.compensate else replace(settings, head=None)
         images = self._replay.render(visible.source, camera, background, compensated)
         whole = self.state.gaussians.replaced({})
         drawn = whole if visible.mask is None else visible.source.gaussians
@@ -259,9 +257,9 @@ class SundaeModel(SplatfactoModel):
         return late
 
     @torch.no_grad()  # a camera optimizer moves views
-    def training_views(self, datamanager: SundaeDatamanager) -> list[TrainingCamera]:
-        """All training views of a datamanager."""
-        return [TrainingCamera(self.camera_of(camera), mask) for camera, mask in datamanager.training_views()]
+    def training_views(self, datamanager: SundaeDatamanager) -> list[tuple[Camera, Tensor | None]]:
+        """All training views of a datamanager, and the pixels of each that count; None for all."""
+        return [(self.camera_of(camera), mask) for camera, mask in datamanager.training_views()]
 
     def contribution(self, datamanager: SundaeDatamanager, count: int | None = None) -> Tensor:
         """Summed blending weight of each Gaussian ``[N]``; see :func:`sundae_ns.scene.render.contribution`."""
@@ -338,8 +336,8 @@ class SundaeModel(SplatfactoModel):
         rgb, base, downscale = outputs["rgb"].detach(), outputs["base_rgb"].detach(), self._get_downscale_factor()
         target = partial(self.truth, batch, {name: outputs.get(name) for name in ("window", "background")}, downscale)
         metrics = LazyOutputs({"gaussian_count": self.source.total})
-        metrics["psnr"] = Later(lambda: psnr(rgb.clamp(0, 1), target()))
-        metrics["psnr_base"] = Later(lambda: psnr(base, target()))
+        metrics["psnr"] = lambda: psnr(rgb.clamp(0, 1), target())
+        metrics["psnr_base"] = lambda: psnr(base, target())
         self.camera_optimizer.get_metrics_dict(metrics)  # type: ignore[arg-type]
         return metrics
 
@@ -403,7 +401,7 @@ class NerfstudioRun:
         """Indices of the training views."""
         return self._datamanager.train_indices
 
-    def training_views(self) -> list[TrainingCamera]:
+    def training_views(self) -> list[tuple[Camera, Tensor | None]]:
         """All training views."""
         return self.model.training_views(self._datamanager)
 

@@ -1,9 +1,10 @@
-"""Classes of a run's configuration that nerfstudio calls: optimizers, their schedules, and the writer of progress."""
+"""Optimizers and their schedules, the writer of progress, and the loop of the trainings outside of nerfstudio's."""
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -81,6 +82,32 @@ class PruneAwareDecay(Scheduler):
         restart = None if config.lr_restart is None else config.lr_restart / lr_init
         shape = config.hold_until_prune, config.warmup_steps, config.shape
         return LambdaLR(optimizer, Decay(config.lr_final / lr_init, config.max_steps, restart, *shape))
+
+
+def optimise(
+    optimizers: Mapping[str, Optimizer], steps: int, factor: Callable[[str, int], float], first: int = 0
+) -> Iterator[int]:
+    """Steps to take, from ``first`` on, with learning rates by the step, so that a resumed training repeats them.
+
+    ``factor`` is of the initial rate of an optimizer (by name): the present one, unless a group holds ``initial_lr``.
+    """
+    groups = [(name, group) for name, optimizer in optimizers.items() for group in optimizer.param_groups]
+    for _, group in groups:
+        group.setdefault("initial_lr", float(group["lr"]))
+    for i in range(first, steps):
+        for name, group in groups:
+            rate = group["initial_lr"] * factor(name, i)
+            # In place, where a recorded CUDA graph reads it.
+            group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], torch.Tensor) else rate
+        yield i
+
+
+def rate_factor(step: int, steps: int) -> float:
+    """Share of the peak rate at a step: a short rise, because Adam has no moments yet, then half a cosine to 0."""
+    rise = max(round(0.05 * steps), 1)
+    if step < rise:
+        return (step + 1) / (rise + 1)
+    return 0.5 * (1 + math.cos(math.pi * (step - rise) / max(steps - rise, 1)))
 
 
 class ProgressWriter(LocalWriter):

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from sundae_ns.core.errors import CheckpointError, ConfigError, PackError, SundaeError
+from sundae_ns.core.errors import CheckpointError, ConfigError, SundaeError
 from sundae_ns.core.metrics import Quality, evaluate
 from sundae_ns.core.values import usual_defaults
 from sundae_ns.cuda.kernels import naming_full_memory
@@ -30,9 +30,10 @@ from sundae_ns.io.pack.config import COARSEST, FINEST, PackConfig, scaled
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
 from sundae_ns.plugin.finished_runs import load_model, place
 from sundae_ns.plugin.model import SundaeModel
+from sundae_ns.plugin.optimizer_configs import optimise, rate_factor
 from sundae_ns.rasterize.gsplat_kernels import Capacity
 from sundae_ns.scene.cameras import spread
-from sundae_ns.scene.optimise import optimise, rate_factor
+from sundae_ns.scene.prune_scene import largest
 from sundae_ns.scene.render import RenderSettings
 from sundae_ns.train.choice import GAIN_PER_DOUBLING
 from sundae_ns.train.graphed_step import StepRecordings
@@ -55,7 +56,7 @@ def finetune(
     *,
     rate: float = RATE,
     data: Path | None = None,
-    progress: Callable[[Tensor], object] | None = None,
+    progress: Callable[[Tensor], object] = lambda _: None,
 ) -> tuple[PackedScene, Codecs]:
     """Train the Gaussians and head of a run with the rounding of its pack in the loop. The run is only read.
 
@@ -79,20 +80,16 @@ def finetune(
     codecs = codecs.to(model.device)
     pipeline.train()
     training = RoundedTraining(model, codecs, rate, head=bool(scene.head))
-
-    def step(i: int) -> None:
-        at = opened.steps + i
-        if training.head:
-            model.step = at  # chooses the crop of a large image
-        camera, batch = pipeline.datamanager.next_train(at)
-        result = training.step(model.step_inputs(camera, batch), model.render_settings(training=True))
-        if progress is not None:
-            progress(result.loss)
-
     generators = [torch.cuda.current_device()] if model.device.type == "cuda" else []
     with naming_full_memory(lambda: model.num_points), torch.random.fork_rng(generators):
         torch.manual_seed(opened.seed or 0)  # of random backgrounds
-        optimise(step, {"pack": training.optimizer}, steps, lambda _, i: rate_factor(i, steps))
+        for i in optimise({"pack": training.optimizer}, steps, lambda _, i: rate_factor(i, steps)):
+            at = opened.steps + i
+            if training.head:
+                model.step = at  # chooses the crop of a large image
+            camera, batch = pipeline.datamanager.next_train(at)
+            result = training.step(model.step_inputs(camera, batch), model.render_settings(training=True))
+            progress(result.loss)
     source = {**scene.meta.get("source", {}), "finetuned": steps}
     exact = {name: value.detach().cpu() for name, value in training.exact.items()}
     trained = replace(
@@ -139,9 +136,10 @@ class RoundedTraining:
 
     def _run(self, inputs: StepInputs, settings: RenderSettings, capacity: Capacity | None) -> StepResult:
         """One step; all of its work is recorded."""
+        parts = self._codecs.gaussians, self.head
+        gaussians, head = ({name: self.exact[name] for name in names} for names in parts)
         with torch.no_grad():  # rounded in place, because recorded graphs read the parameters there
-            rounded = self._codecs.rounded({name: self.exact[name] for name in self._codecs.gaussians})
-            rounded |= self._codecs.rounded_head({name: self.exact[name] for name in self.head})
+            rounded = self._codecs.rounded(gaussians) | self._codecs.rounded_head(head)
             for name, value in rounded.items():
                 self.rounded[name].copy_(value)
         model = self._model
@@ -150,8 +148,6 @@ class RoundedTraining:
         of_rate: tuple[Tensor | None, ...] = (None,) * len(self.exact)
         if self._rate > 0:
             with torch.enable_grad():
-                parts = self._codecs.gaussians, self.head
-                gaussians, head = ({name: self.exact[name] for name in names} for names in parts)
                 bits = estimated_bits(self._codecs, gaussians, head)
                 total = self._rate * torch.stack(list(bits.values())).sum()
             of_rate = torch.autograd.grad(total, list(self.exact.values()), allow_unused=True)
@@ -216,7 +212,7 @@ class Candidate(NamedTuple):
 
 
 class Search:
-    """Packs of one scene at several factors, judged by the run's test views; ``PackError`` if none meets a limit.
+    """Packs of one scene at several factors, judged by the run's test views; ``ConfigError`` if none meets a limit.
 
     ``fit`` has the options at the factor 1, or the codecs of a fine-tune, whose grids and bases no factor changes.
     """
@@ -248,56 +244,41 @@ class Search:
 
     def smaller_than(self, limit: int) -> Candidate:
         """The finest pack of at most ``limit`` bytes; that at the factor 1 if it fits and, by chance, loses less."""
-        coarsest = self.at(COARSEST)
-        if coarsest.bytes > limit:
-            drop = ""
-            with suppress(SundaeError):  # sizes need no capture
-                drop = f" and loses {self.drop(coarsest):.2f} dB"
-            raise PackError(f"the smallest pack has {coarsest.bytes:,} bytes{drop}; give a larger --max-mb")
-        finest = self._bisected(lambda candidate: candidate.bytes <= limit, coarsest, COARSEST, FINEST)
-        with suppress(SundaeError):
+        finest = largest(self.at, lambda candidate: candidate.bytes, limit)
+        with suppress(SundaeError):  # sizes need no capture
             if self.default.bytes <= limit and self.drop(self.default) < self.drop(finest):
                 return self.default
         return finest
 
     def better_than(self, limit: float) -> Candidate:
         """The coarsest pack that loses at most ``limit`` dB, no larger than that at the factor 1 if this one fits."""
-
-        def fits(candidate: Candidate) -> bool:
-            return self.drop(candidate) <= limit
-
-        if fits(self.default):
-            coarsest = self._bisected(fits, self.default, 0.0, COARSEST)
-            return min(self.default, coarsest, key=lambda candidate: candidate.bytes)
-        finest = self.at(FINEST)
-        if (drop := self.drop(finest)) > limit:
-            loss = f"the finest pack loses {drop:.3f} dB at {finest.bytes:,} bytes"
-            raise PackError(f"{loss}; give a larger --target-drop")
-        return self._bisected(fits, finest, FINEST, 0.0)
-
-    def _bisected(self, fits: Callable[[Candidate], bool], best: Candidate, first: float, last: float) -> Candidate:
-        """The fitting pack nearest to ``last``, from a fitting one at ``first``."""
+        first, last, best = 0.0, COARSEST, self.default
+        if self.drop(best) > limit:
+            first, last, best = FINEST, 0.0, self.at(FINEST)
+            if (drop := self.drop(best)) > limit:
+                loss = f"the finest pack loses {drop:.3f} dB at {best.bytes:,} bytes"
+                raise ConfigError(f"{loss}; give a larger --target-drop")
         for _ in range(7):
             middle = (first + last) / 2
             candidate = self.at(middle)
-            if fits(candidate):
+            if self.drop(candidate) <= limit:
                 first, best = middle, candidate
             else:
                 last = middle
-        return best
+        return self.default if first >= 0 and self.default.bytes <= best.bytes else best
 
 
 def best_pack(searches: Sequence[Search], *, most_bytes: int | None = None, most_drop: float = 0.0) -> Candidate:
     """The pack that loses least in at most ``most_bytes``, or else the smallest that loses at most ``most_drop`` dB.
 
-    The searches are of one run, the preferred one last; ``PackError`` if none meets the limit.
+    The searches are of one run, the preferred one last; ``ConfigError`` if none meets the limit.
     """
-    packs, failure = list[tuple[Search, Candidate]](), PackError("there is no pack")
+    packs, failure = list[tuple[Search, Candidate]](), ConfigError("there is no pack")
     for search in searches if most_bytes is not None else reversed(searches):
         try:
             pack = search.better_than(most_drop) if most_bytes is None else search.smaller_than(most_bytes)
             packs.append((search, pack))
-        except PackError as error:
+        except ConfigError as error:
             failure = error
     if not packs:
         raise failure

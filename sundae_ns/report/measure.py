@@ -31,7 +31,7 @@ from sundae_ns.scene.frames import FrameReplay
 from sundae_ns.scene.load_save import load
 from sundae_ns.scene.render import GaussianSource, RenderSettings, compensate, draw, scale_plan
 from sundae_ns.scene.scene import Scene, render
-from sundae_ns.scene.virtual_cameras import of_unit_size, resized, size_of
+from sundae_ns.scene.virtual_cameras import of_unit_size, resized
 
 if TYPE_CHECKING:
     from sundae_ns.plugin.finished_runs import Opened
@@ -159,7 +159,7 @@ class Subject:
     @torch.no_grad()
     def image(self, index: int, *, head: bool = True) -> Tensor:
         """A view as viewers render it, in [0, 1] ``[H, W, 3]``."""
-        settings = self.settings if head else self.settings.without_head()
+        settings = self.settings if head else replace(self.settings, head=None)
         with naming_full_memory(lambda: self.source.total):
             return self.frames.render(self.source, self.cameras[index], self.background, settings)["rgb"]
 
@@ -194,15 +194,15 @@ def against_photos(data: Path | None) -> Callable[[Path], Subject]:
 
 def against_first(path: Path, whole: Scene, cameras: Sequence[Camera]) -> Callable[[Path], Subject]:
     """A function that opens scenes in views of the scene at a path, ``whole``, whose images are the truth."""
-    size = size_of(whole)
-    full, scaled = of_unit_size(whole, cameras)
-    views = [(camera.to(full.device), render(full, camera).rgb) for camera in scaled]
+    full, scaled, size = of_unit_size(whole, cameras)
+    views = [(camera, render(full, camera).rgb) for camera in scaled]
 
     def subject(other: Path) -> Subject:
         if other == path:
             return Subject.of_file(full, path, path.name, [])
         scene = replace(aligned(load(other), whole), background_color=whole.background_color).to(full.device)
-        return Subject.of_file(resized(scene, 1 / size), other, path.name, views)
+        scene = replace(scene, gaussians=resized(scene.gaussians, 1 / size))
+        return Subject.of_file(scene, other, path.name, views)
 
     return subject
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence, Sized
+from collections.abc import Sequence
 from itertools import permutations
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,13 +24,7 @@ from sundae_ns.scene.virtual_cameras import FOV, middle_and_reach, usable, virtu
 
 MOST_FRAMES = 36_000  # of a film: 25 minutes
 MOST_CAMERAS = 10_000  # of a file
-
-
-class CameraFile(NamedTuple):
-    """Cameras of a file, with the frames per second of a camera path; None for those of a capture."""
-
-    cameras: list[Camera]
-    frames_per_second: float | None
+Pinhole = tuple[np.ndarray, Sequence[float], int, int]  # OpenGL camera-to-world [3 or 4, 4], fx fy cx cy, width, height
 
 
 def camera_in_front(scene: Scene) -> Camera:
@@ -41,8 +35,7 @@ def camera_in_front(scene: Scene) -> Camera:
     up = torch.tensor(scene.up or (0.0, 0.0, 1.0))
     side = torch.tensor([1.0, 0.0, 0.0] if abs(float(up[0])) < 0.9 else [0.0, 1.0, 0.0])
     back = torch.nn.functional.normalize(torch.linalg.cross(side, up), dim=0)
-    fov = 2 * math.degrees(math.atan(240 / 500))  # that of the web page
-    return Camera.look_at(center + away * back, center, up, fov=fov)
+    return Camera.look_at(center + away * back, center, up, fov=2 * math.degrees(math.atan(240 / 500)))  # as the page
 
 
 def cameras_of(path: Path | str, scene: Scene | None = None) -> list[Camera]:
@@ -65,64 +58,72 @@ def cameras_of(path: Path | str, scene: Scene | None = None) -> list[Camera]:
     >>> sn.cameras_of(path)[0].center
     tensor([0., 0., 3.])
     """
-    return read_cameras(Path(path), scene).cameras
+    return read_cameras(Path(path), scene)[0]
 
 
-def read_cameras(path: Path, scene: Scene | None = None) -> CameraFile:
-    """As :func:`cameras_of`, with the speed of a camera path."""
+def read_cameras(path: Path, scene: Scene | None = None) -> tuple[list[Camera], float | None]:
+    """As :func:`cameras_of`, with the frames per second of a camera path; None for other files."""
+    content: dict[str, Any] = {}
     if path.is_dir() and any((path / name).exists() for name in ("cameras.bin", "cameras.txt")):
-        return CameraFile(_of_colmap(path, scene), None)
-    path = path / "transforms.json" if path.is_dir() else path
-    content = read_json(path)
-    if "camera_path" in content:
-        speed = finite(content.get("fps", 24), "fps", path.name, positive=True)
-        return CameraFile(_camera_path(content, path.name), speed)
-    frames = content.get("frames")
-    if not isinstance(frames, list) or not frames:
-        raise DataError(f"{path} holds neither frames nor a camera_path; give a transforms.json or a camera path")
-    _check_number(frames, path.name)
-    content = with_focal_lengths(content, path.parent)
-    transform, scale = _to_model(scene, content, path.name)
-    cameras = []
-    for i, entry in enumerate(frames):
-        where = f"{path.name}, frame {i}"
-        stated = {**content, **entry} if isinstance(entry, dict) else {}
-        kind_of_frame(stated, where)
-        pose = rigid(matrix(stated.get("transform_matrix"), (3, 4), "transform_matrix", where), where)
-        names = ("fl_x", "fl_y", "cx", "cy")
-        intrinsics = [finite(stated.get(name), name, where, positive=name.startswith("fl")) for name in names]
-        size = [side(stated.get(name), name, where) for name in ("w", "h")]
-        cameras.append(_moved(pose, transform, scale, intrinsics, *size))
-    return CameraFile(cameras, None)
+        entries: Any = list(read_images(path).values())
+    else:
+        path = path / "transforms.json" if path.is_dir() else path
+        content = with_focal_lengths(read_json(path), path.parent)
+        entries = content.get("camera_path", content.get("frames"))
+        if not isinstance(entries, list) or not entries:
+            raise DataError(f"{path} holds neither frames nor a camera_path; give a transforms.json or a camera path")
+    if len(entries) > MOST_CAMERAS:
+        raise DataError(f"{path.name} has {len(entries):,} cameras; give at most {MOST_CAMERAS:,}")
+    read = _of_path if "camera_path" in content else _of_frame if content else _of_colmap
+    (transform, scale), cameras = _to_model(scene, content, path.name), list[Camera]()
+    for i, entry in enumerate(entries):
+        pose, intrinsics, width, height = read(entry, content, f"{path.name}, frame {i}")
+        moved = transform[:3, :3] @ pose[:3]
+        moved[:, 3] = scale * (moved[:, 3] + transform[:3, 3])
+        cameras.append(Camera.from_pose(torch.from_numpy(moved), intrinsics, width, height))
+    speed = finite(content.get("fps", 24), "fps", path.name, positive=True) if read is _of_path else None
+    return cameras, speed
 
 
-def _moved(
-    pose: np.ndarray, transform: np.ndarray, scale: float, intrinsics: Sequence[float], width: int, height: int
-) -> Camera:
-    """The camera of a pose, camera-to-world with OpenGL axes ``[3 or 4, 4]``, after a transform and then a scale."""
-    moved = transform[:3, :3] @ pose[:3]
-    moved[:, 3] = scale * (moved[:, 3] + transform[:3, 3])
-    return Camera.from_pose(torch.from_numpy(moved), intrinsics, width, height)
+def _of_frame(entry: Any, content: dict[str, Any], where: str) -> Pinhole:
+    """A camera of a ``transforms.json``."""
+    stated = {**content, **entry} if isinstance(entry, dict) else {}
+    kind_of_frame(stated, where)
+    pose = rigid(matrix(stated.get("transform_matrix"), (3, 4), "transform_matrix", where), where)
+    names = ("fl_x", "fl_y", "cx", "cy")
+    intrinsics = [finite(stated.get(name), name, where, positive=name.startswith("fl")) for name in names]
+    return pose, intrinsics, side(stated.get("w"), "w", where), side(stated.get("h"), "h", where)
 
 
-def _of_colmap(model: Path, scene: Scene | None) -> list[Camera]:
-    """Cameras of a COLMAP model, in its own coordinates or in those of a run trained on it."""
-    transform, scale = _to_model(scene, {}, model.name)
-    cameras, images = [], read_images(model)
-    _check_number(images, model.name)
-    for image in images.values():
-        quaternion, translation = torch.tensor(image.pose, dtype=torch.float64).split([4, 3])
-        rotation = rotation_matrices(quaternion[None])[0].T
-        pose = torch.cat([rotation * rotation.new_tensor(OPENGL_TO_OPENCV), -(rotation @ translation)[:, None]], dim=1)
-        camera = image.camera
-        cameras.append(_moved(pose.numpy(), transform, scale, camera.intrinsics, camera.width, camera.height))
-    return cameras
+def _of_colmap(image: Any, _: dict[str, Any], __: str) -> Pinhole:
+    """A camera of a COLMAP model."""
+    quaternion, translation = torch.tensor(image.pose, dtype=torch.float64).split([4, 3])
+    rotation = rotation_matrices(quaternion[None])[0].T
+    pose = torch.cat([rotation * rotation.new_tensor(OPENGL_TO_OPENCV), -(rotation @ translation)[:, None]], dim=1)
+    return pose.numpy(), image.camera.intrinsics, image.camera.width, image.camera.height
+
+
+def _of_path(entry: Any, content: dict[str, Any], where: str) -> Pinhole:
+    """A camera of a path of nerfstudio's viewer."""
+    if content.get("camera_type", "perspective") != "perspective":
+        raise DataError(f"{where} has cameras of type {content['camera_type']!r}; use perspective ones")
+    width, height = (side(content.get(f"render_{name}"), f"render_{name}", where) for name in ("width", "height"))
+    flat = entry.get("camera_to_world") if isinstance(entry, dict) else None
+    rows = [flat[k : k + 4] for k in range(0, 16, 4)] if isinstance(flat, list) and len(flat) == 16 else flat
+    pose, fov = (
+        matrix(rows, (4,), "camera_to_world", where),
+        finite(entry.get("fov", 60.0), "fov", where, positive=True),
+    )
+    if not fov < 180:
+        raise DataError(f"{where}: fov is {fov:g}; it must be below 180 degrees")
+    focal = height / 2 / math.tan(math.radians(fov) / 2)
+    return pose, (focal, focal, width / 2, height / 2), width, height
 
 
 def _to_model(scene: Scene | None, content: dict[str, Any], where: str) -> tuple[np.ndarray, float]:
     """Transform ``[4, 4]`` and then scale, from the coordinates of a ``transforms.json`` to those of a scene."""
     frame = scene.meta.get("frame") if scene is not None else None
-    if frame is None:
+    if frame is None or "camera_path" in content:  # of the viewer, which shows the model
         return np.eye(4), 1.0
     transform, applied = np.eye(4), np.eye(4)  # a run states its transform for the capture before the applied one
     transform[:3] = np.asarray(frame["transform"], np.float64)[:3]
@@ -130,33 +131,6 @@ def _to_model(scene: Scene | None, content: dict[str, Any], where: str) -> tuple
         applied[:3] = matrix(content["applied_transform"], (3,), "applied_transform", where)
     scale = float(frame["scale"]) / finite(content.get("applied_scale", 1.0), "applied_scale", where, positive=True)
     return transform @ np.linalg.inv(applied), scale
-
-
-def _check_number(cameras: Sized, where: str) -> None:
-    if len(cameras) > MOST_CAMERAS:
-        raise DataError(f"{where} has {len(cameras):,} cameras; give at most {MOST_CAMERAS:,}")
-
-
-def _camera_path(content: dict[str, Any], where: str) -> list[Camera]:
-    """Cameras of a path of nerfstudio's viewer, in the coordinates of the model."""
-    entries = content["camera_path"]
-    if not isinstance(entries, list) or not entries:
-        raise DataError(f"{where} has an empty camera_path; add keyframes in the viewer, and export it again")
-    _check_number(entries, where)
-    if content.get("camera_type", "perspective") != "perspective":
-        raise DataError(f"{where} has cameras of type {content['camera_type']!r}; use perspective ones")
-    width, height = (side(content.get(f"render_{name}"), f"render_{name}", where) for name in ("width", "height"))
-    cameras = []
-    for i, entry in enumerate(entries):
-        named = f"{where}, camera {i}"
-        flat = entry.get("camera_to_world") if isinstance(entry, dict) else None
-        rows = [flat[k : k + 4] for k in range(0, 16, 4)] if isinstance(flat, list) and len(flat) == 16 else flat
-        pose = matrix(rows, (4,), "camera_to_world", named)
-        fov = finite(entry.get("fov", 60.0), "fov", named, positive=True)
-        if not fov < 180:
-            raise DataError(f"{named}: fov is {fov:g}; it must be below 180 degrees")
-        cameras.append(Camera.from_fov(torch.from_numpy(pose), fov, width, height))
-    return cameras
 
 
 def is_frame(stated: Any) -> bool:
@@ -184,7 +158,7 @@ def with_start(scene: Scene, start_view: str | None, up: Sequence[float] | None)
     if start_view is None:
         return scene
     if not start_view.lstrip("-").isdigit():
-        return dataclasses.replace(scene, start=read_cameras(Path(start_view), scene).cameras[0])
+        return dataclasses.replace(scene, start=cameras_of(start_view, scene)[0])
     if not 0 <= int(start_view) < len(scene.cameras):
         stored = f"--start-view 0 to {len(scene.cameras) - 1}, or a camera file" if scene.cameras else "a camera file"
         raise ConfigError(f"there is no camera {start_view} in the scene; give {stored}")
@@ -243,15 +217,13 @@ def _circle(scene: Scene, up: Array) -> tuple[Array, Array]:
 
 def _tour(points: Array, most: int = 8) -> Array:
     """The first of points ``[N, C]`` and at most ``most - 1`` typical others, in the order of the shortest way back."""
-    chosen = [0]
+    chosen = list(range(len(points)))
     if len(points) > most:
         from scipy.cluster.vq import kmeans2  # takes long, and a file of cameras needs none
 
         centers, _ = kmeans2(points, most, minit="++", rng=np.random.default_rng(0))
         centers = np.delete(centers, np.linalg.norm(centers - points[0], axis=1).argmin(), axis=0)
-        chosen += [int(np.linalg.norm(points - center, axis=1).argmin()) for center in centers]
-    else:
-        chosen += range(1, len(points))
+        chosen = [0, *(int(np.linalg.norm(points - center, axis=1).argmin()) for center in centers)]
     keys = points[sorted(set(chosen))]
     apart = np.linalg.norm(keys[:, None] - keys, axis=2)
     orders = np.array([(0, *order, 0) for order in permutations(range(1, len(keys)))])

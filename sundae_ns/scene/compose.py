@@ -1,21 +1,26 @@
-"""A scene in other coordinates, and several scenes as one."""
+"""A scene cut by a box, clean of floaters, or in other coordinates, and several scenes as one."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
+import numpy as np
 import torch
+from rich.console import Console
+from torch import Tensor
 from torch.nn.functional import pad
 
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.covariance import rotation_matrices
 from sundae_ns.core.errors import ConfigError, DataError
-from sundae_ns.core.gaussians import FEATURES, Gaussians
+from sundae_ns.core.gaussians import FEATURES, Gaussians, sanitise
 from sundae_ns.core.values import AnyArray, numbers
 from sundae_ns.head.head import CompensationHead
 from sundae_ns.io.coordinates import similarity
-from sundae_ns.scene.scene import Scene, unit
+from sundae_ns.pruning.floaters import STRENGTH, floater_odds
+from sundae_ns.scene.prune_scene import weights_in
+from sundae_ns.scene.scene import Scene, unit, usable_cameras, within
 
 
 def transform(
@@ -131,3 +136,84 @@ def _same(head: CompensationHead | None, other: CompensationHead | None) -> bool
         return head is other
     pairs = zip(head.state_dict().values(), other.state_dict().values())
     return head.config == other.config and all(torch.equal(value.cpu(), same.cpu()) for value, same in pairs)
+
+
+def crop(scene: Scene, low: AnyArray, high: AnyArray) -> Scene:
+    """The Gaussians whose centres are in a box, its faces included; everything else of the scene stays.
+
+    Args:
+        scene: to cut; it does not change.
+        low, high: lowest and highest x, y and z of the box, in the coordinates of the scene's file.
+
+    Raises:
+        ConfigError: the box is empty or not finite.
+        DataError: no Gaussian is in the box.
+
+    >>> import torch, sundae_ns as sn
+    >>> scene = sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3))
+    >>> sn.crop(scene, (0, 0, 0), (1, 1, 2)).num_gaussians
+    200
+    """
+    return scene[crop_mask(scene, low, high)]
+
+
+def remove_floaters(
+    scene: Scene, strength: float = STRENGTH, *, cameras: Camera | Iterable[Camera] | None = None
+) -> Scene:
+    """The scene without what floats or is not seen.
+
+    Args:
+        scene: to clean; it does not change.
+        strength: from 0, only what is certain to float, to 1, all that may; see :func:`.floater_odds`.
+        cameras: cameras of the photographs; by default those stored with the scene. Without any, neighbours decide.
+
+    Raises:
+        ConfigError: the strength is not from 0 to 1.
+        DataError: no Gaussian is finite, or the cameras see none.
+
+    >>> import torch, sundae_ns as sn
+    >>> scene = sn.Scene.from_points(torch.rand(2000, 3), torch.full((2000, 3), 0.5))
+    >>> sn.remove_floaters(scene).num_gaussians > 1900
+    True
+    """
+    return scene[~floater_mask(scene, scene.cameras if cameras is None else usable_cameras(cameras), strength)]
+
+
+def crop_mask(scene: Scene, low: AnyArray, high: AnyArray) -> Tensor:
+    """True for the Gaussians in a box, bool ``[N]``; arguments and errors as for :func:`crop`."""
+    means = scene.gaussians["means"].detach().double()  # exact, and holds survey coordinates
+    means = means + means.new_tensor(scene.offset or (0.0, 0.0, 0.0))
+    lowest, highest = (numbers(corner, "a corner of the box", (3,)).to(means.device) for corner in (low, high))
+    if not bool((lowest < highest).all()):
+        raise ConfigError("the box is empty; give its lowest x y z first, then its highest")
+    inside = ((means >= lowest) & (means <= highest)).all(dim=1)
+    if not bool(inside.any()):
+        finite = means[means.isfinite().all(dim=1)].cpu().numpy()
+        if not len(finite):
+            raise DataError("no Gaussian is in the box, because none is finite; export the scene again")
+        digits, ends = 3 if scene.offset is None else 10, np.quantile(finite, (0.05, 0.95), axis=0)
+        corners = (" ".join(f"{value:.{digits}g}" for value in corner) for corner in ends)
+        raise DataError(f"no Gaussian is in the box; most of them lie between {' and '.join(corners)}")
+    return inside
+
+
+def for_cleaning(cameras: Sequence[Camera]) -> list[Camera]:
+    """The cameras with images of at most 512 pixels a side, which tell what is seen at all."""
+    return [camera.zoomed(min(512 / max(camera.width, camera.height), 1.0)) for camera in cameras]
+
+
+@torch.no_grad()
+def floater_mask(
+    scene: Scene, cameras: Sequence[Camera], strength: float = STRENGTH, console: Console | None = None
+) -> Tensor:
+    """True for floaters, bool ``[N]``; arguments and errors as for :func:`remove_floaters`."""
+    if not 0 <= strength <= 1:
+        raise ConfigError(f"the strength of remove-floaters is {strength}; give 0 (careful) to 1 (thorough)")
+    sanitised = sanitise(scene.gaussians)
+    if not sanitised.gaussians.num_gaussians:
+        raise DataError("no Gaussian is finite; export the scene again")
+    floats = floater_odds(sanitised.gaussians) > 6.5 - 5 * strength  # logarithms
+    if cameras:
+        usable = dataclasses.replace(scene, gaussians=sanitised.gaussians)
+        floats |= weights_in(usable, for_cleaning(cameras), console=console) <= 0
+    return ~within(sanitised.mask, ~floats)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import re
 import zipfile
@@ -16,14 +15,16 @@ from rich.console import Console
 from torch import Tensor
 
 from sundae_ns.core.camera import Camera
-from sundae_ns.core.gaussians import bytes_of, sanitise
+from sundae_ns.core.files import replacing
+from sundae_ns.core.gaussians import bytes_of
 from sundae_ns.head.head import bytes_of_module
 from sundae_ns.io.config_file import find_config
 from sundae_ns.io.formats import METAS, kind_of, kind_of_gaussians
 from sundae_ns.io.pack.container import read_header
 from sundae_ns.scene.cameras import spread
-from sundae_ns.scene.prune_scene import at_most, floater_mask, for_cleaning, weights_in
-from sundae_ns.scene.scene import Scene
+from sundae_ns.scene.compose import floater_mask, for_cleaning
+from sundae_ns.scene.prune_scene import at_most, weights_in
+from sundae_ns.scene.scene import Scene, image_of, render
 from sundae_ns.scene.virtual_cameras import by_device, virtual_cameras
 
 HELD_OUT = 16  # cameras that tell what a change costs
@@ -39,6 +40,14 @@ def held_out_cameras(scene: Scene, cameras: Sequence[Camera], count: int = HELD_
     if not cameras:
         return virtual_cameras(scene, count, seed=seed + 1)
     return [at_most(cameras[i], by_device(PIXELS, scene.device)) for i in spread(len(cameras), count)]
+
+
+def write_preview(path: Path, before: Scene, after: Scene, cameras: Sequence[Camera]) -> None:
+    """Write images of two scenes, side by side, as a PNG: of the held-out camera in which they differ most."""
+    pairs = [[render(scene, view).rgb for scene in (before, after)] for view in held_out_cameras(before, cameras)]
+    most = max(pairs, key=lambda pair: float((pair[0] - pair[1]).square().mean()))
+    with replacing(path) as partial:
+        image_of(torch.cat(most, dim=1)).save(partial, "png")
 
 
 def bytes_at(path: Path) -> int | None:
@@ -59,7 +68,6 @@ def describe(
     ``crop`` a box, lowest corner first, that holds 99% of what the cameras see. They are ``cameras``, by default those
     stored with the scene, else virtual ones.
     """
-    scene = dataclasses.replace(scene, gaussians=sanitise(scene.gaussians).gaussians)
     gaussians, cameras = scene.gaussians, cameras or scene.cameras
     views = for_cleaning(cameras) or virtual_cameras(scene, LOOKING)
     weights, means = weights_in(scene, views, console=console), gaussians["means"].double()

@@ -9,7 +9,7 @@ import logging
 from collections import UserDict
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from threading import Lock
 from typing import Any, NamedTuple
@@ -26,7 +26,7 @@ from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.pruning.scores import response
 from sundae_ns.rasterize.gsplat_backend import RecordableGsplat
 from sundae_ns.rasterize.gsplat_kernels import Capacity
-from sundae_ns.scene.render import GaussianSource, RenderSettings, degree_in_use, render_view, scale_plan, splat
+from sundae_ns.scene.render import GaussianSource, RenderSettings, render_view, scale_plan, splat
 
 _log = logging.getLogger(__name__)
 
@@ -37,21 +37,17 @@ SPARE_CAPACITY = 1.5  # for tile and Gaussian pairs, as a multiple of the record
 REPLAYED = ("rgb", "base_rgb", "accumulation")  # images of a recorded frame
 
 
-@dataclass(frozen=True)
-class Later:
-    """An output that is not computed yet. It may be in another thread, after the model has changed."""
-
-    make: Callable[[], Any]
-
-
 class LazyOutputs(UserDict[str, Any]):
-    """Named outputs. One that is :class:`Later` is computed on first access, without gradients, and then kept."""
+    """Named outputs. A function is called on first access, without gradients, and its value kept.
+
+    That may be in another thread, after the model has changed.
+    """
 
     def __getitem__(self, name: str) -> Any:
         value = self.data[name]
-        if isinstance(value, Later):
+        if callable(value):
             with torch.no_grad():
-                value = self.data[name] = value.make()
+                value = self.data[name] = value()
         return value
 
 
@@ -89,8 +85,7 @@ def late_outputs(
     alpha = images["accumulation"]
 
     def depth() -> Tensor:
-        splatted = splat(drawn, camera, drawn["opacities"], settings, render_depth=True).depth
-        assert splatted is not None
+        splatted: Any = splat(drawn, camera, drawn["opacities"], settings, render_depth=True).depth
         return torch.where(alpha > 0, splatted, splatted.max())  # empty pixels are farthest
 
     def features() -> Tensor:
@@ -105,7 +100,7 @@ def late_outputs(
             return torch.zeros_like(alpha)
         return splat(drawn, camera, (shown if mask is None else shown[mask])[:, None], settings).colors
 
-    outputs = {**images, "depth": Later(depth), "features": Later(features), "response": Later(response_image)}
+    outputs = {**images, "depth": depth, "features": features, "response": response_image}
     return LazyOutputs({name: outputs[name] for name in OUTPUTS})
 
 
@@ -132,8 +127,7 @@ def principal_components(features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def feature_colors(features: Tensor, mean: Tensor, basis: Tensor, deviations: Tensor, alpha: Tensor) -> Tensor:
     """Rendered features ``[H, W, F]``, weighted by ``alpha``, as colours; [0, 1] are six deviations."""
     components = (features - alpha * mean) @ basis
-    scaled = components / (6 * deviations.clamp_min(1e-8)) + 0.5 * alpha
-    return scaled.clamp(0, 1)
+    return (components / (6 * deviations.clamp_min(1e-8)) + 0.5 * alpha).clamp(0, 1)
 
 
 def response_values(response: Tensor) -> Tensor:
@@ -209,12 +203,10 @@ class FrameReplay:
         if addresses != self._gaussians:
             self._frames.clear()
             self._gaussians = addresses
-        head = settings.head
-        of_head: tuple[object, ...] | None = None
-        if head is not None:  # the network itself and not its id, which a later network could reuse
-            options = tuple(vars(head.config).values())
-            of_head = (head.net, head.addresses(), options, *scale_plan(camera, settings.trained_focal))
-        degree = degree_in_use(gaussians.sh_degree, settings.active_sh_degree)
+        head, plan = settings.head, scale_plan(camera, settings.trained_focal)
+        # The network itself and not its id, which a later network could reuse.
+        of_head = None if head is None else (head.net, head.addresses(), tuple(vars(head.config).values()), *plan)
+        degree = min(gaussians.sh_degree, settings.active_sh_degree)
         return camera.width, camera.height, settings.antialiased, gaussians.encoding, degree, of_head
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sundae_ns.core.errors import CheckpointError, ConfigError, DataError, writing
+from sundae_ns.core.errors import CheckpointError, ConfigError, DataError
 from sundae_ns.core.files import write_bytes
 from sundae_ns.core.gaussians import FEATURES
 from sundae_ns.data.capture import read_json
@@ -23,7 +23,6 @@ from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.io.ply import Marks
 from sundae_ns.scene.cameras import is_frame
 from sundae_ns.scene.page import packed_in, packed_of, write_page
-from sundae_ns.scene.render import degree_in_use
 from sundae_ns.scene.scene import Scene
 
 SUFFIXES = (*FORMATS, ".sundae", ".html")  # of the files that save() writes
@@ -85,7 +84,7 @@ def load_with_mask(path: Path, device: torch.device | str = "cpu") -> tuple[Scen
     return Scene(sanitised.gaussians, **facts).to(device), sanitised.mask
 
 
-def save(scene: Scene, path: Path | str, *, upright: bool = False) -> None:
+def save(scene: Scene, path: Path | str, *, upright: bool = False, config: PackConfig | None = None) -> None:
     """Write a scene in the format of the file's suffix, atomically; an existing file is replaced.
 
     ``.sundae`` holds everything that a render needs, quantised. ``.html`` is a web page that renders it. ``.ply``
@@ -96,6 +95,7 @@ def save(scene: Scene, path: Path | str, *, upright: bool = False) -> None:
         path: file to write; a missing folder of it is made.
         upright: turn from nerfstudio's z-up axes to the -y-up axes of viewers; ``.ply``, ``.spz`` and ``.sog`` only. A
             ``.glb`` is upright in any case.
+        config: precision of a packed scene or of that in a page; by default ``PackConfig()``.
 
     Raises:
         ConfigError: the suffix is not supported, or the format is not turned.
@@ -108,37 +108,22 @@ def save(scene: Scene, path: Path | str, *, upright: bool = False) -> None:
     >>> sn.load(path).num_gaussians
     50
     """
-    write_scene(scene, Path(path), upright=upright)
-
-
-def write_scene(scene: Scene, path: Path, *, upright: bool = False, config: PackConfig | None = None) -> None:
-    """As :func:`save`, with the precision of a pack, that of a page included."""
+    path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise ConfigError(f"{path} has no supported suffix; name it {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
     if upright and suffix not in FORMATS:
         raise ConfigError(f"{suffix} files keep their coordinates; leave out upright")
-    with writing(f"cannot write {path}"):
-        if suffix in FORMATS:
-            save_for_viewers(scene, path, upright=upright)
-        elif suffix == ".html":
-            write_page(path, (path.resolve().stem, scene, packed_of(scene, config)))
-        else:
-            write_bytes(path, packed_of(scene, config))
+    if suffix in FORMATS:
+        formats.write_for_viewers(path, scene.gaussians, marks_of(scene), upright=upright)
+    elif suffix == ".html":
+        write_page(path, (path.resolve().stem, scene, packed_of(scene, config)))
+    else:
+        write_bytes(path, packed_of(scene, config))
 
 
-def save_for_viewers(scene: Scene, path: Path, *, upright: bool = False) -> dict[str, Tensor]:
-    """Write base colours in a format of other viewers; returns the written Gaussians. See :func:`save`."""
-    return formats.write_for_viewers(path, scene.gaussians, _marks_of(scene), upright=upright)
-
-
-def save_levels(levels: Sequence[Scene], folder: Path, *, upright: bool = False) -> None:
-    """Write the base colours of levels of detail, the full one first, as streamed SOG; see :func:`save`."""
-    gaussians = [level.gaussians for level in levels]
-    formats.write_levels(folder, gaussians, _marks_of(levels[0]), upright=upright)
-
-
-def _marks_of(scene: Scene) -> Marks:
+def marks_of(scene: Scene) -> Marks:
+    """What a file of Gaussians may state of a scene."""
     return Marks(scene.antialiased, scene.in_model_frame, scene.up, scene.offset)
 
 
@@ -146,15 +131,14 @@ def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -
     """The scene of a checkpoint with the contents ``loaded``, on the CPU; ``CheckpointError`` if they do not fit."""
     options = model_options(config)
     gaussians, state = checkpoint.gaussians_of(loaded, source), checkpoint.model_state(loaded)
-    extra = state.get(checkpoint.EXTRA_STATE)
-    extra = extra if isinstance(extra, Mapping) else {}
+    extra = found if isinstance(found := state.get(checkpoint.EXTRA_STATE), Mapping) else {}
     focal = extra.get("trained_focal")
     head = _head_of(state, options, source) if extra.get("head_enabled") else None
     if head is not None:
         gaussians[FEATURES] = state[f"gauss_params.{FEATURES}"].float()
     degree, interval = gaussians.sh_degree, options.get("sh_degree_interval")
     if options.get("warm_start") is None and isinstance(interval, int):
-        degree = degree_in_use(degree, int(loaded["step"]) // max(interval, 1))  # training did not reach the others
+        degree = min(degree, int(loaded["step"]) // max(interval, 1))  # training did not reach the others
     gaussians["features_rest"] = gaussians["features_rest"][:, : (degree + 1) ** 2 - 1]
     gaussians = formats.usable(gaussians, source).gaussians
     frame, upright = None, orientation_of(config) in ("up", "vertical")  # by default z is up

@@ -13,13 +13,14 @@ from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import ConfigError, PackError
 from sundae_ns.core.gaussians import FEATURES, Gaussians, sanitise
 from sundae_ns.head.head import CompensationHead, HeadConfig
+from sundae_ns.io.coordinates import Direction
 from sundae_ns.io.pack.codecs import Sensitivity
 from sundae_ns.io.pack.container import FORMAT, fault
 from sundae_ns.io.pack.packed_scene import PackedScene
 from sundae_ns.rasterize.reference import harmonic_basis
 from sundae_ns.scene.cameras import is_frame, spread
 from sundae_ns.scene.render import GaussianSource, render_view
-from sundae_ns.scene.scene import Direction, Scene, unit
+from sundae_ns.scene.scene import Scene, unit
 
 _MODEL: dict[str, Any] = FORMAT["model"]
 _PROPERTIES: dict[str, Any] = FORMAT["header"]["properties"]
@@ -39,13 +40,17 @@ def scene_of(packed: PackedScene) -> Scene:
         meta.pop("frame", None)
     source = meta.get("source")
     up, start = start_of(packed.meta)
+    cameras, arrays = tuple[Camera, ...](), packed.cameras
+    if arrays is not None:
+        rows = zip(arrays["poses"], arrays["intrinsics"].tolist(), arrays["sizes"].tolist(), strict=True)
+        cameras = tuple(Camera.from_pose(pose, intrinsics, *size) for pose, intrinsics, size in rows)
     return Scene(
         Gaussians(dict(packed.gaussians), "logits" if degree == 0 else "harmonics"),
         _head_of(packed, stated.get("head")),
         background_color=stated["background_color"],
         antialiased=stated["rasterize_mode"] == "antialiased",
         trained_focal=None if focal is None else (float(focal[0]), float(focal[1])),
-        cameras=cameras_of_arrays(packed.cameras),
+        cameras=cameras,
         up=up,
         start=start,
         in_model_frame=not isinstance(source, dict) or source.get("model_frame") is not False,
@@ -61,8 +66,7 @@ def contents_of(scene: Scene) -> PackedScene:
     gaussians = {name: value.detach() for name, value in scene.gaussians.items() if name != FEATURES or head}
     stated = _MODEL["properties"]["head"]["required"]
     options = None if scene.head is None else {name: getattr(scene.head.config, name) for name in stated}
-    # Degree 0 stands for logits.
-    degree = 0 if scene.gaussians.encoding == "logits" else max(scene.gaussians.sh_degree, 1)
+    degree = 0 if scene.gaussians.encoding == "logits" else max(scene.gaussians.sh_degree, 1)  # 0 stands for logits
     model = {
         "sh_degree": degree,
         "rasterize_mode": "antialiased" if scene.antialiased else "classic",
@@ -80,8 +84,7 @@ def contents_of(scene: Scene) -> PackedScene:
 def stated_start(scene: Scene) -> dict[str, Any]:
     """Entries ``up`` and ``start`` of a packed file's header; ``ConfigError`` for values that readers would refuse."""
     stated: dict[str, Any] = {} if scene.up is None else {"up": list(scene.up)}
-    if scene.start is not None:
-        camera = scene.start
+    if (camera := scene.start) is not None:
         stated["start"] = {
             "pose": camera.pose.double().tolist(),
             "intrinsics": camera.K.double()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(),
@@ -102,16 +105,8 @@ def start_of(stated: Mapping[str, Any]) -> tuple[Direction | None, Camera | None
     return unit(stated["up"]) if "up" in valid else None, camera
 
 
-def cameras_of_arrays(cameras: Mapping[str, Tensor] | None) -> tuple[Camera, ...]:
-    """Cameras of a packed file, on the CPU; none for None."""
-    if cameras is None:
-        return ()
-    rows = zip(cameras["poses"], cameras["intrinsics"].tolist(), cameras["sizes"].tolist(), strict=True)
-    return tuple(Camera.from_pose(pose, intrinsics, *size) for pose, intrinsics, size in rows)
-
-
 def arrays_of_cameras(cameras: Sequence[Camera]) -> dict[str, Tensor]:
-    """Counterpart of :func:`cameras_of_arrays`."""
+    """Cameras as a packed file holds them: poses ``[V, 3, 4]``, intrinsics ``[V, 4]`` and sizes ``[V, 2]``."""
     return {
         "poses": torch.stack([camera.pose for camera in cameras]).cpu(),
         "intrinsics": torch.stack([camera.K[[0, 1, 0, 1], [0, 1, 2, 2]] for camera in cameras]).double().cpu(),

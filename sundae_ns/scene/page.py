@@ -20,8 +20,8 @@ from pathlib import Path
 from PIL import Image
 
 from sundae_ns.core.camera import Camera
-from sundae_ns.core.errors import ConfigError, MemoryExhaustedError, PackError, reading, writing
-from sundae_ns.core.files import write_bytes, write_text
+from sundae_ns.core.errors import ConfigError, MemoryExhaustedError, PackError, reading
+from sundae_ns.core.files import write_files
 from sundae_ns.core.values import whole
 from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.scene.cameras import camera_in_front
@@ -30,9 +30,8 @@ from sundae_ns.scene.virtual_cameras import middle_and_reach, usable
 
 LARGE = 10_000_000  # bytes of a page from which show() warns: notebooks load all of their outputs at once
 _log = logging.getLogger(__name__)
-
-
 View = Camera | int | str  # that a page names: a camera, the index of a stored one, or the link that the page copies
+Shown = tuple[str, Scene, bytes]  # a scene on a page: its name, itself, and its packed file
 
 
 def page(scenes: Scene | Mapping[str, Scene], path: Path | str, *, views: Mapping[str, View] | None = None) -> None:
@@ -55,10 +54,7 @@ def page(scenes: Scene | Mapping[str, Scene], path: Path | str, *, views: Mappin
     """
     path = Path(path)
     named = {path.resolve().stem: scenes} if isinstance(scenes, Scene) else dict(scenes)
-    write_page(path, *((name, scene, packed_of(scene)) for name, scene in named.items()), views=views or {})
-
-
-Shown = tuple[str, Scene, bytes]  # a scene on a page: its name, itself, and its packed file
+    write_page(path, *((name, scene, packed_of(scene)) for name, scene in named.items()), views=views)
 
 
 def packed_of(scene: Scene, config: PackConfig | None = None) -> bytes:
@@ -69,25 +65,15 @@ def packed_of(scene: Scene, config: PackConfig | None = None) -> bytes:
     return pack_bytes(*fit_scene(contents_of(scene), config))[0]
 
 
-def page_of(*shown: Shown, views: Mapping[str, View] | None = None) -> str:
-    """The HTML of a page that contains its scenes; arguments as for :func:`write_page`."""
-    return _filled(shown, views or {}, [(base64.b64encode(packed).decode(), "") for *_, packed in shown])
-
-
 def write_page(path: Path, *shown: Shown, views: Mapping[str, View] | None = None) -> int:
     """Write the page of one or two scenes as one file, or without a suffix as a folder; returns the bytes."""
-    if path.suffix:
-        write_text(path, page_of(*shown, views=views))
-        return path.stat().st_size
-    # The scenes first: a page without its scene shows an error.
-    files = {f"scene{i or ''}.sundae": packed for i, (*_, packed) in enumerate(shown)}
-    index = _filled(shown, views or {}, [("", name) for name in files])
-    with writing(f"cannot write to {path}"):
-        path.mkdir(parents=True, exist_ok=True)
-    for name, packed in files.items():
-        write_bytes(path / name, packed)
-    write_text(path / "index.html", index)
-    return sum((path / name).stat().st_size for name in (*files, "index.html"))
+    names = [] if path.suffix else [f"scene{i or ''}.sundae" for i in range(len(shown))]
+    content = page_of(*shown, views=views, files=names).encode(errors="backslashreplace")
+    # The first is put in place last: without its scene a page shows an error.
+    files = {path if path.suffix else path / "index.html": content}
+    files |= {path / name: packed for name, (*_, packed) in zip(names, shown)}
+    write_files(files)
+    return sum(map(len, files.values()))
 
 
 def packed_in(page: Path) -> bytes:
@@ -97,15 +83,15 @@ def packed_in(page: Path) -> bytes:
         return base64.b64decode(content.partition(">")[2].partition("<")[0] or "none", validate=True)
 
 
-def _filled(shown: Sequence[Shown], views: Mapping[str, View], contents: Sequence[tuple[str, str]]) -> str:
-    """The page with its scenes in base64, or with their addresses."""
+def page_of(*shown: Shown, views: Mapping[str, View] | None = None, files: Sequence[str] = ()) -> str:
+    """The HTML of a page that contains its scenes, or that reads them from files beside it; see :func:`page`."""
     if not 1 <= len(shown) <= 2:
         raise ConfigError(f"a page of {len(shown)} scenes was asked for; give one or two")
-    links = json.dumps([(name, link_of(view, shown[0][1], name)) for name, view in views.items()])
+    links = json.dumps([(name, link_of(view, shown[0][1], name)) for name, view in (views or {}).items()])
     places = [
         f'<script type="application/octet-stream" class="scene" data-name="{html.escape(name)}"'
-        f' data-source="{source}">{inline}</script>'
-        for (name, *_), (inline, source) in zip(shown, contents, strict=True)
+        f' data-source="{file}">{"" if file else base64.b64encode(packed).decode()}</script>'
+        for (name, _, packed), file in zip(shown, files or [""] * len(shown), strict=True)
     ]
     values = {"TITLE": html.escape(" | ".join(name for name, *_ in shown)), "POSTER": _poster(shown[0][1])}
     values |= {"VIEWS": links.replace("<", "\\u003c"), "SCENES": "\n".join(places)}

@@ -1,13 +1,21 @@
-"""Pruning of a scene by what cameras see of it, without photographs; cuts by a box, and of floaters."""
+"""Pruning of a scene by what cameras see of it, without photographs, also to a size.
+
+What a file of a size holds is a trade: more Gaussians, or more bits for each. So a few :class:`Form` are tried, each
+with as many Gaussians as fit by a sample, and the one whose images are nearest to those of the full scene is taken.
+Contributions and the graph are computed once. What is taken is then fitted, and rounded or counted to the size.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache, partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple, TypeVar
 
-import numpy as np
 import torch
 from rich.console import Console
 from rich.progress import Progress
@@ -15,20 +23,27 @@ from torch import Tensor
 
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import ConfigError, DataError
-from sundae_ns.core.gaussians import Gaussians, sanitise
-from sundae_ns.core.values import AnyArray, numbers, whole
+from sundae_ns.core.gaussians import MAX_SH_DEGREE, Gaussians, sanitise
+from sundae_ns.core.tables import MEGABYTE
+from sundae_ns.core.values import numbers, whole
 from sundae_ns.cuda.adam import Update, adam_step
 from sundae_ns.graph.graph import NeighborGraph
+from sundae_ns.io.pack.config import COARSEST, FINEST, PackConfig, scaled
 from sundae_ns.pruning.decision import prune_gaussians
-from sundae_ns.pruning.floaters import STRENGTH, floater_odds
+from sundae_ns.pruning.merge import gaussian_graph
 from sundae_ns.pruning.rule import PruneRule, kept_count
 from sundae_ns.rasterize.interface import rasterize_cameras
-from sundae_ns.scene.render import GaussianSource, RenderSettings, TrainingCamera, contribution, pass_inputs
-from sundae_ns.scene.scene import Scene, measure, usable_cameras
-from sundae_ns.scene.virtual_cameras import by_device, of_unit_size, resized, size_of, split, virtual_cameras
+from sundae_ns.scene.render import GaussianSource, RenderSettings, contribution, pass_inputs
+from sundae_ns.scene.scene import Scene, measure, render, usable_cameras, within
+from sundae_ns.scene.virtual_cameras import by_device, of_unit_size, resized, split, virtual_cameras
 
 REFIT = {"cpu": (192, 1, 0.7), "cuda": (128, 4, 1.0)}  # steps of a refit, images of each, and factor of its rates
 REFIT_PIXELS, MOST_PIXELS = 1 << 18, 1 << 22  # most pixels of an image of a refit, and of one that tells what is seen
+SAMPLED = 64, 8192  # random Gaussians of two files, which tell the bytes of each more one
+LEAST, AIM = 0.97, 0.985  # shares of the size: what is near enough, and what each file aims at
+JUDGES, PIXELS = 8, 1 << 16  # cameras that compare candidates, and most pixels of their images
+MOST_FILES = 8  # of the last search
+T = TypeVar("T")
 
 
 class PrunedScene(NamedTuple):
@@ -90,40 +105,35 @@ def prune_with_mask(
     fit: bool = True,
     weights: Tensor | None = None,
     graph: NeighborGraph | None = None,
+    images: Sequence[Tensor] = (),
 ) -> PrunedScene:
     """As :func:`prune`, with the mask of the kept Gaussians; without ``fit``, a training that follows fits them.
 
-    ``weights`` ``[M]`` of the finite Gaussians, by :func:`weights_in`, and their ``graph`` are not computed again.
+    ``weights``, ``images`` (:func:`weights_in`) and ``graph`` of the finite Gaussians, if given, are not made anew.
     """
     if (keep is None) == (count is None):
         raise ConfigError("prune needs either keep (a share) or count (a number of Gaussians); give one of them")
     if keep is not None and not 0 < float(numbers(keep, "keep", ())) <= 1:
         raise ConfigError(f"keep is {keep}; give a share in (0, 1], 0.1 to keep a tenth")
-    if count is not None:
-        whole(count, "count")
     rule, sanitised = rule or PruneRule(), sanitise(scene.gaussians)
     n = sanitised.gaussians.num_gaussians
-    if keep is not None:
-        count = kept_count(keep, n)
-    assert count is not None
+    count = whole(count, "count") if keep is None else kept_count(keep, n)
     usable = dataclasses.replace(scene, gaussians=sanitised.gaussians)
-    console, images = Console(stderr=True) if progress else None, list[Tensor]()
+    console = Console(stderr=True) if progress else None
     if not rule.uses_contribution or count >= n:
         weights = None
     else:
         given = cameras if cameras is not None else scene.cameras or virtual_cameras(usable)
         if weights is None:
+            images = list[Tensor]()
             weights = weights_in(usable, given, count if rule.uses_detail else None, console, images if fit else None)
     pruned = prune_gaussians(sanitised.gaussians, rule, count, weights, graph)
     small = dataclasses.replace(scene, gaussians=pruned.gaussians)
     if weights is not None and rule.refits and fit:
-        size, (full, scaled) = size_of(usable), of_unit_size(usable, given)
-        scaled = [camera.to(scene.device) for camera in scaled]
-        gaussians = resized(small, 1 / size).gaussians
-        settings = scene.settings(head=False)
-        fitted = refit(gaussians, full.gaussians, scaled, settings, images=images, seed=rule.seed, console=console)
-        fitted = resized(dataclasses.replace(scene, gaussians=fitted), size).gaussians
-        small = dataclasses.replace(scene, gaussians=fitted)
+        full, scaled, size = of_unit_size(usable, given)
+        settings, unit = scene.settings(head=False), resized(pruned.gaussians, 1 / size)
+        fitted = refit(unit, full.gaussians, scaled, settings, images=images, seed=rule.seed, console=console)
+        small = dataclasses.replace(scene, gaussians=resized(fitted, size))
     mask = within(sanitised.mask, pruned.decision.mask)
     seen = None if weights is None else float((weights > 0).float().mean())
     return PrunedScene(small, mask, seen, rule.redistribution == "merge" and count < n)
@@ -144,8 +154,8 @@ def weights_in(
     """Blending weight of each Gaussian of a finite scene ``[N]``, by :func:`.contribution`; ``DataError`` for none."""
     if any(camera.width * camera.height > REFIT_PIXELS for camera in cameras):
         images = None  # a refit reads smaller ones
-    sized, scaled = of_unit_size(scene, [at_most(camera, MOST_PIXELS) for camera in cameras])
-    views = [TrainingCamera(camera.to(scene.device), None) for camera in scaled]
+    sized, scaled, _ = of_unit_size(scene, [at_most(camera, MOST_PIXELS) for camera in cameras])
+    views = [(camera, None) for camera in scaled]
     source, settings = GaussianSource(sized.gaussians), scene.settings(head=False)
     weights = contribution(source, views, scene.background, settings, count, images=images, console=console)
     if not bool((weights > 0).any()):
@@ -234,7 +244,7 @@ def count_for_drop(
     """
     if len(cameras) < 2:
         raise ConfigError("a target needs two views or more, because one of them is held out; give more views")
-    scene, cameras = of_unit_size(scene, cameras)
+    scene, cameras, _ = of_unit_size(scene, cameras)
     trained, held_out = split(cameras)
     tolerated = 1e-3 * (10 ** (drop / 10) - 1)  # mean squared error
     n, before = sanitise(scene.gaussians).gaussians.num_gaussians, 0.0
@@ -253,92 +263,146 @@ def count_for_drop(
     return n, curve
 
 
-def crop(scene: Scene, low: AnyArray, high: AnyArray) -> Scene:
-    """The Gaussians whose centres are in a box, its faces included; everything else of the scene stays.
+class Form(NamedTuple):
+    """How a file states Gaussians."""
 
-    Args:
-        scene: to cut; it does not change.
-        low, high: lowest and highest x, y and z of the box, in the coordinates of the scene's file.
+    degree: int = MAX_SH_DEGREE  # Most SH degree
+    power: float = 0.0  # Steps of a pack: powers of two of the usual ones
 
-    Raises:
-        ConfigError: the box is empty or not finite.
-        DataError: no Gaussian is in the box.
+    @classmethod
+    def choices(cls, scene: Scene, suffix: str) -> list[Form]:
+        """Forms to choose from, the most exact first: packs have steps, other files a degree of harmonics."""
+        degree = scene.gaussians.sh_degree
+        if suffix in (".sundae", ".html"):
+            return [cls(degree, power) for power in (0.0, 0.75, 1.5)]
+        return [cls(each) for each in sorted({degree, min(degree, 1), 0}, reverse=True)]
 
-    >>> import torch, sundae_ns as sn
-    >>> scene = sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3))
-    >>> sn.crop(scene, (0, 0, 0), (1, 1, 2)).num_gaussians
-    200
+    @property
+    def precision(self) -> PackConfig:
+        """That of a pack."""
+        return scaled(PackConfig(), self.power)
+
+    def of(self, scene: Scene) -> Scene:
+        """The scene without the harmonics above the degree."""
+        rest = scene.gaussians["features_rest"][:, : (self.degree + 1) ** 2 - 1]
+        return dataclasses.replace(scene, gaussians=scene.gaussians.replaced({"features_rest": rest}))
+
+
+def prune_to_bytes(
+    scene: Scene,
+    most: int,
+    write: Callable[[PrunedScene, Form, Path], int],
+    forms: Sequence[Form],
+    cameras: Sequence[Camera],
+    rule: PruneRule,
+    *,
+    progress: bool = False,
+) -> tuple[PrunedScene, Form]:
+    """The scene and the form of a file of 97 to 100% of ``most`` bytes; of fewer if that is all.
+
+    The scene is finite; ``write`` puts a file into a folder, and returns its bytes. Every eighth of the ``cameras``
+    compares the forms. ``progress`` shows bars and remarks on stderr. ``ConfigError`` if hardly a Gaussian fits.
     """
-    return scene[crop_mask(scene, low, high)]
+    n, packs = scene.num_gaussians, len({form.power for form in forms}) > 1
+    order = torch.randperm(n, generator=torch.Generator().manual_seed(0)).to(scene.device)
+    with TemporaryDirectory() as folder:
+
+        @cache
+        def bytes_of(pruned: PrunedScene, form: Form) -> int:
+            return write(pruned, form, Path(folder))
+
+        def rounded(pruned: PrunedScene, form: Form) -> Form:
+            return largest(lambda power: form._replace(power=power), partial(bytes_of, pruned), most, form.power)
+
+        def rows(count: int) -> PrunedScene:
+            mask = torch.zeros(n, dtype=torch.bool, device=scene.device).index_fill_(0, order[:count], True)
+            return PrunedScene(scene[mask], mask)
+
+        def sampled(form: Form) -> tuple[float, float]:
+            """Bytes of no Gaussian, and of each."""
+            few, many = (min(n, count) for count in SAMPLED)
+            first, second = bytes_of(rows(few), form), bytes_of(rows(many), form)
+            each = (second - first) / (many - few) if many > few else first / n
+            return first - few * each, each
+
+        lines = [sampled(form) for form in forms]
+        # Sparser Gaussians take more bytes each, so the whole scene takes at most about this.
+        if lines[0][0] + n * lines[0][1] <= most and bytes_of(whole := rows(n), forms[0]) <= most:
+            form = rounded(whole, forms[0]) if packs else forms[0]
+            if (size := bytes_of(whole, form)) < LEAST * most and progress:
+                print(f"the whole scene takes {size / MEGABYTE:.2f} MB, less than was asked for", file=sys.stderr)
+            return whole, form
+        counts = [min(n, int((AIM * most - fixed) / each)) for fixed, each in lines]
+        possible = [i for i, count in enumerate(counts) if count > 0]
+        if not possible:
+            raise ConfigError(f"a file without Gaussians has {lines[-1][0]:,.0f} bytes; give more than {most:,}")
+        graph = gaussian_graph(scene.gaussians, rule) if rule.uses_graph and n > 1 else None
+        weights, images = None, list[Tensor]()
+        if rule.uses_contribution:
+            console = Console(stderr=True) if progress else None
+            middle = max(sorted(counts)[len(counts) // 2], 1)
+            weights = weights_in(scene, cameras, middle if rule.uses_detail else None, console, images)
+
+        @cache
+        def cut(count: int, fit: bool = False) -> PrunedScene:
+            known: dict[str, Any] = {"weights": weights, "graph": graph, "images": images}
+            return prune_with_mask(scene, None, count, cameras, rule, progress=progress, fit=fit, **known)
+
+        best = possible[0]
+        if len(possible) > 1:
+            judges = [at_most(camera, PIXELS) for camera in (split(cameras)[1] or list(cameras))[:JUDGES]]
+            truths, as_read = [render(scene, camera).rgb for camera in judges], _as_packed if packs else Form.of
+            best = max(possible, key=lambda i: measure(as_read(forms[i], cut(counts[i]).scene), truths, judges).psnr)
+        form, pruned = forms[best], cut(counts[best], fit=packs)
+        if packs:
+            return pruned, rounded(pruned, form)
+
+        def fewer(fit: bool, power: float) -> PrunedScene:
+            return cut(max(round(n / 2**power), 1), fit)
+
+        for fit in (False, True):  # a fit hardly changes the bytes, so it begins with a count that fits without
+            halvings, powers = math.log2(n / len(pruned.scene)), (0.0, math.log2(n))
+            pruned = largest(partial(fewer, fit), partial(bytes_of, form=form), most, halvings, powers, 1.0)
+    return pruned, form
 
 
-def remove_floaters(
-    scene: Scene, strength: float = STRENGTH, *, cameras: Camera | Iterable[Camera] | None = None
-) -> Scene:
-    """The scene without what floats or is not seen.
+def _as_packed(form: Form, scene: Scene) -> Scene:
+    """The scene as a reader of its pack sees it."""
+    from sundae_ns.io.pack.packed_scene import fit_scene  # its encoder needs a compiler, which other files do not
+    from sundae_ns.scene.packing import contents_of
 
-    Args:
-        scene: to clean; it does not change.
-        strength: from 0, only what is certain to float, to 1, all that may; see :func:`.floater_odds`.
-        cameras: cameras of the photographs; by default those stored with the scene. Without any, neighbours decide.
+    packed, codecs = fit_scene(contents_of(scene), form.precision)
+    gaussians = Gaussians(codecs.rounded(packed.gaussians), scene.gaussians.encoding)
+    return dataclasses.replace(scene, gaussians=gaussians).to(scene.device)
 
-    Raises:
-        ConfigError: the strength is not from 0 to 1.
-        DataError: no Gaussian is finite, or the cameras see none.
 
-    >>> import torch, sundae_ns as sn
-    >>> scene = sn.Scene.from_points(torch.rand(2000, 3), torch.full((2000, 3), 0.5))
-    >>> sn.remove_floaters(scene).num_gaussians > 1900
-    True
+def largest(
+    at: Callable[[float], T],
+    bytes_of: Callable[[T], int],
+    most: int,
+    power: float = 0.0,
+    powers: tuple[float, float] = (FINEST, COARSEST),
+    per_halving: float = 2.2,
+) -> T:
+    """The largest of some files that has at most ``most`` bytes; one of 97% is near enough.
+
+    ``at`` makes a file, the smaller, the higher a power within ``powers``; by default of the steps of a pack. The
+    search begins at ``power``; about ``per_halving`` more take half of the bytes. ``ConfigError`` if none is found.
     """
-    return scene[~floater_mask(scene, scene.cameras if cameras is None else usable_cameras(cameras), strength)]
-
-
-def within(mask: Tensor | None, inner: Tensor) -> Tensor:
-    """Apply a mask ``inner`` ``[M]`` to the M true entries of a mask ``[N]``; None stands for all true."""
-    if mask is None:
-        return inner
-    narrowed = mask.clone()
-    narrowed[mask] = inner
-    return narrowed
-
-
-def crop_mask(scene: Scene, low: AnyArray, high: AnyArray) -> Tensor:
-    """True for the Gaussians in a box, bool ``[N]``; arguments and errors as for :func:`crop`."""
-    # In float64, which is exact, and holds survey coordinates.
-    means = scene.gaussians["means"].detach().double()
-    means = means + means.new_tensor(scene.offset or (0.0, 0.0, 0.0))
-    lowest, highest = (numbers(corner, "a corner of the box", (3,)).to(means.device) for corner in (low, high))
-    if not bool((lowest < highest).all()):
-        raise ConfigError("the box is empty; give its lowest x y z first, then its highest")
-    inside = ((means >= lowest) & (means <= highest)).all(dim=1)
-    if not bool(inside.any()):
-        finite = means[means.isfinite().all(dim=1)].cpu().numpy()
-        if not len(finite):
-            raise DataError("no Gaussian is in the box, because none is finite; export the scene again")
-        digits, ends = 3 if scene.offset is None else 10, np.quantile(finite, (0.05, 0.95), axis=0)
-        corners = (" ".join(f"{value:.{digits}g}" for value in corner) for corner in ends)
-        raise DataError(f"no Gaussian is in the box; most of them lie between {' and '.join(corners)}")
-    return inside
-
-
-def for_cleaning(cameras: Sequence[Camera]) -> list[Camera]:
-    """The cameras with images of at most 512 pixels a side, which tell what is seen at all."""
-    return [camera.zoomed(min(512 / max(camera.width, camera.height), 1.0)) for camera in cameras]
-
-
-@torch.no_grad()
-def floater_mask(
-    scene: Scene, cameras: Sequence[Camera], strength: float = STRENGTH, console: Console | None = None
-) -> Tensor:
-    """True for floaters, bool ``[N]``; arguments and errors as for :func:`remove_floaters`."""
-    if not 0 <= strength <= 1:
-        raise ConfigError(f"the strength of remove-floaters is {strength}; give 0 (careful) to 1 (thorough)")
-    sanitised = sanitise(scene.gaussians)
-    if not sanitised.gaussians.num_gaussians:
-        raise DataError("no Gaussian is finite; export the scene again")
-    floats = floater_odds(sanitised.gaussians) > 6.5 - 5 * strength  # logarithms
-    if cameras:
-        usable = dataclasses.replace(scene, gaussians=sanitised.gaussians)
-        floats |= weights_in(usable, for_cleaning(cameras), console=console) <= 0
-    return ~within(sanitised.mask, ~floats)
+    (low, high), best, before = powers, None, None
+    for _ in range(MOST_FILES):
+        made = at(power)
+        size = bytes_of(made)
+        if size <= most:
+            high, best = power, made
+        else:
+            low = power
+        if LEAST * most <= size <= most or high - low < 0.01:
+            break
+        if before is not None and before[1] != size:
+            per_halving = max((power - before[0]) / math.log2(before[1] / size), 0.5)
+        guess = min(max(power + per_halving * math.log2(size / (AIM * most)), powers[0]), powers[1])
+        before, power = (power, size), guess if low <= guess <= high and guess != power else (low + high) / 2
+    if best is None:
+        raise ConfigError(f"the smallest file has {size:,} bytes; give more than {most:,}")
+    return best

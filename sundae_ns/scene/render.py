@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import DataError
-from sundae_ns.core.gaussians import FEATURES, Gaussians
+from sundae_ns.core.gaussians import FEATURES, MAX_SH_DEGREE, Gaussians
 from sundae_ns.head.head import CompensationHead, ScalePlan, plan, resize
 from sundae_ns.pruning.scores import pixel_detail
 from sundae_ns.rasterize.interface import blending_weights, harmonic_colors, rasterize
@@ -35,36 +35,32 @@ class StepResolution(NamedTuple):
     mirror: bool = False  # Whether half of the steps mirror their image
 
 
-class TrainingCamera(NamedTuple):
-    """A training view for passes that do not train."""
-
-    camera: Camera
-    mask: Tensor | None  # Pixels that count, bool ``[H, W, 1]``; None for all
-
-
 @dataclass(frozen=True)
-class ColorSettings:
-    """How colours are evaluated for a camera."""
+class RenderSettings:
+    """What images depend on beside Gaussians and view."""
 
     backend: Backend
-    active_sh_degree: int | None = None  # Highest SH degree in use; None for that of the Gaussians
+    active_sh_degree: int = MAX_SH_DEGREE  # Highest SH degree in use, at most that of the Gaussians
+    antialiased: bool = False
+    """Whether opacities compensate for the smallest footprint (``rasterize_mode`` of splatfacto)."""
+    training: bool = False
+    """Whether gradients are needed. Images are then not clamped, and the head runs at their scale."""
+    absgrad: bool = False  # Whether to sum absolute gradients of the projected centres
+    head: CompensationHead | None = None  # The head; None while it is disabled
+    trained_focal: tuple[float, float] | None = None
+    """Shortest and longest focal length of the images that the head was trained on, pixels."""
 
 
-def colors_from(params: Mapping[str, Tensor], gaussians: Gaussians, center: Tensor, settings: ColorSettings) -> Tensor:
+def colors_from(params: Mapping[str, Tensor], gaussians: Gaussians, center: Tensor, settings: RenderSettings) -> Tensor:
     """Colours of Gaussians as seen from a camera centre ``[3]``, or one for each ``[M, 3]``; at least 0 ``[M, 3]``.
 
     ``params`` has ``means``, ``features_dc`` and ``features_rest`` of M of the ``gaussians``, which give the encoding.
     """
     if gaussians.encoding == "logits":
         return params["features_dc"].sigmoid()
-    degree = degree_in_use(gaussians.sh_degree, settings.active_sh_degree)
+    degree = min(gaussians.sh_degree, settings.active_sh_degree)
     coefficients = params["features_dc"], params["features_rest"]
     return harmonic_colors(degree, params["means"], center, *coefficients, backend=settings.backend)
-
-
-def degree_in_use(sh_degree: int, active: int | None) -> int:
-    """The SH degree that colours are evaluated at: ``active``, at most ``sh_degree``; None for ``sh_degree``."""
-    return sh_degree if active is None else min(active, sh_degree)
 
 
 class GaussianSource:
@@ -79,35 +75,12 @@ class GaussianSource:
         """Number of Gaussians in all processes."""
         return self.gaussians.num_gaussians
 
-    def primitives(
-        self, camera: Camera, settings: ColorSettings, *, features: bool, colors: bool = True
-    ) -> dict[str, Tensor]:
+    def primitives(self, camera: Camera, settings: RenderSettings, *, features: bool) -> dict[str, Tensor]:
         """Parameters of the Gaussians that the view may see ``[M, ...]``, with ``colors`` from its camera ``[M, 3]``.
 
-        ``features`` and ``colors`` say whether feature vectors and colours are needed.
+        ``features`` says whether feature vectors are needed.
         """
-        primitives = dict(self.gaussians)
-        if colors:
-            primitives["colors"] = colors_from(self.gaussians, self.gaussians, camera.center, settings)
-        return primitives
-
-
-@dataclass(frozen=True)
-class RenderSettings(ColorSettings):
-    """What images depend on beside Gaussians and view."""
-
-    antialiased: bool = False
-    """Whether opacities compensate for the smallest footprint (``rasterize_mode`` of splatfacto)."""
-    training: bool = False
-    """Whether gradients are needed. Images are then not clamped, and the head runs at their scale."""
-    absgrad: bool = False  # Whether to sum absolute gradients of the projected centres
-    head: CompensationHead | None = None  # The head; None while it is disabled
-    trained_focal: tuple[float, float] | None = None
-    """Shortest and longest focal length of the images that the head was trained on, pixels."""
-
-    def without_head(self) -> RenderSettings:
-        """The same settings with the head disabled."""
-        return replace(self, head=None)
+        return {**self.gaussians, "colors": colors_from(self.gaussians, self.gaussians, camera.center, settings)}
 
 
 def pass_inputs(
@@ -145,10 +118,8 @@ def draw(
     if settings.head is not None:
         channels = torch.cat([channels, primitives[FEATURES]], dim=1)
     splatted = splat(primitives, camera, channels, settings, render_depth=depth, absgrad=settings.absgrad)
-    blended, features = splatted.colors[..., :3], splatted.colors[..., 3:]
-    base = (blended + (1 - splatted.alpha) * background).clamp(0.0, 1.0)
-    images = {"rgb": base, "base_rgb": base, "depth": splatted.depth, "accumulation": splatted.alpha}
-    return {**images, "feature_image": features}, splatted
+    base = (splatted.colors[..., :3] + (1 - splatted.alpha) * background).clamp(0.0, 1.0)
+    return {"rgb": base, "base_rgb": base, "depth": splatted.depth, "accumulation": splatted.alpha}, splatted
 
 
 def compensate(head: CompensationHead, base: Tensor, splatted: Rasterization, background: Tensor) -> Tensor:
@@ -170,7 +141,7 @@ def render_view(
 ) -> tuple[dict[str, Any], Rasterization]:
     """The images of one view over a background ``[3]``: Gaussians, one splatting pass, and the head.
 
-    They are ``rgb, base_rgb, depth, accumulation, feature_image``, each ``[H, W, C]``, beside the rasteriser's result.
+    They are ``rgb, base_rgb, depth, accumulation``, each ``[H, W, C]``, beside the rasteriser's result.
     One of another scale than the head was trained at gets the resized correction of that (:mod:`sundae_ns.head.head`).
     """
     head = settings.head
@@ -218,7 +189,7 @@ def may_be_seen(means: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, siz
 @torch.no_grad()
 def contribution(
     source: GaussianSource,
-    cameras: Sequence[TrainingCamera],
+    cameras: Sequence[tuple[Camera, Tensor | None]],
     background: Tensor,
     settings: RenderSettings,
     count: int | None = None,
@@ -228,17 +199,15 @@ def contribution(
 ) -> Tensor:
     """Blending weight of each Gaussian over a fixed background, summed over the pixels of all views ``[N]``.
 
-    With ``count``, the number of Gaussians that a prune will keep, pixels are weighted by the detail that these cannot
-    show (:func:`.pixel_detail`), and blended colours and accumulation of each view, float16 ``[H, W, 4]``, are appended
-    to ``images``. ``DataError`` if a mask has another size than its view.
+    Cameras come with a mask of the pixels that count, bool ``[H, W, 1]``, or None. With ``count``, the number of
+    Gaussians that a prune will keep, pixels are weighted by the detail that these cannot show (:func:`.pixel_detail`),
+    and blended colours and accumulation of each view, float16 ``[H, W, 4]``, are appended to ``images``. ``DataError``
+    if a mask has another size than its view.
     """
-    total = source.gaussians["means"].new_zeros(source.gaussians.num_gaussians)
-    tracked: Iterable[TrainingCamera] = cameras
-    if console is not None:
-        from rich.progress import track  # takes 20 ms, which a render without a prune need not spend
+    from rich.progress import track  # takes 20 ms, which a render without a prune need not spend
 
-        tracked = track(cameras, "Contribution of Gaussians", transient=True, console=console)
-    for camera, mask in tracked:
+    total, label = source.gaussians["means"].new_zeros(source.gaussians.num_gaussians), "Contribution of Gaussians"
+    for camera, mask in track(cameras, label, transient=True, console=console, disable=console is None):
         if mask is not None and tuple(mask.shape) != (camera.height, camera.width, 1):
             size = f"{camera.width} x {camera.height}"
             raise DataError(f"a mask is {list(mask.shape)} but its view is {size} px; give masks of their images' size")
@@ -247,16 +216,16 @@ def contribution(
             view = camera.viewmat[None], camera.K[None], torch.tensor([[camera.width, camera.height]])
             (rows,) = may_be_seen(source.gaussians["means"], source.gaussians["scales"], *view)
             seen = GaussianSource(source.gaussians.rows(rows))
-        primitives = seen.primitives(camera, settings, features=False, colors=count is not None)
         pixels = None if mask is None else mask[..., 0].to(total)
         if count is None:
-            weights = blending_weights(pass_inputs(primitives, camera, settings), pixels, backend=settings.backend)
+            weights = blending_weights(pass_inputs(seen.gaussians, camera, settings), pixels, backend=settings.backend)
         else:
             # As in blending_weights, but one pass gives the image and the weights: the gradient of the first channel.
+            primitives = seen.primitives(camera, settings, features=False)
             fixed = {name: value.detach() for name, value in primitives.items()}
             colors = fixed["colors"].requires_grad_()
             with torch.enable_grad():
-                drawn, splatted = draw(fixed, camera, background.to(total), settings.without_head(), depth=False)
+                drawn, splatted = draw(fixed, camera, background.to(total), replace(settings, head=None), depth=False)
                 # A prune keeps the same share of the visible Gaussians as of all.
                 cells = count / source.total * float((splatted.radii > 0).sum())
                 detail = pixel_detail(drawn["base_rgb"].detach(), cells)

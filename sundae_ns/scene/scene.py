@@ -22,12 +22,12 @@ from sundae_ns.core.values import AnyArray, floats, numbers, positions, usual_de
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.data.images import to_srgb
 from sundae_ns.data.photos import photo_of, upright
+from sundae_ns.graph.neighbors import knn
 from sundae_ns.head.head import CompensationHead
+from sundae_ns.io.coordinates import Direction
 from sundae_ns.rasterize.interface import BackendName, select_backend
-from sundae_ns.scene.initialization import from_points
 from sundae_ns.scene.render import SHOWN_BACKGROUNDS, GaussianSource, RenderSettings, render_view
 
-Direction = tuple[float, float, float]
 Background = Literal["random", "black", "white"]
 """Names of backgrounds; a scene that was trained over ``random`` ones is shown on nerfstudio's grey."""
 
@@ -57,9 +57,7 @@ class Scene:
     """JSON values that a packed scene carries along: ``frame``, ``capture``, ``source``."""
 
     def __post_init__(self) -> None:
-        def put(name: str, value: object) -> None:
-            object.__setattr__(self, name, value)
-
+        put = super().__setattr__  # of a frozen class
         put("gaussians", checked(self.gaussians))
         features = self.gaussians[FEATURES].shape[1] if FEATURES in self.gaussians else 0
         if self.head is not None and features != self.head.config.num_features:
@@ -96,7 +94,7 @@ class Scene:
             raise DataError("some points are NaN or infinite; remove them, and their colours")
         if whole(sh_degree, "sh_degree", 0) > MAX_SH_DEGREE:
             raise ConfigError(f"sh_degree is {sh_degree}; give at most {MAX_SH_DEGREE}")
-        return cls(Gaussians(from_points(points, colors.to(points.device), sh_degree=sh_degree, num_features=0)))
+        return cls(Gaussians(from_points(points, colors.to(points.device), sh_degree=sh_degree)))
 
     @classmethod
     @usual_defaults()
@@ -193,8 +191,7 @@ class Scene:
     @property
     def device(self) -> torch.device:
         """Device of the Gaussians and the head."""
-        device: torch.device = self.gaussians["means"].device
-        return device
+        return self.means.device
 
     @property
     def background(self) -> Tensor:
@@ -228,6 +225,46 @@ class Scene:
         return f"Scene({self.num_gaussians:,} Gaussians, SH degree {self.gaussians.sh_degree}, {head}, {self.device})"
 
 
+def from_points(points: Tensor, rgb: Tensor, *, sh_degree: int) -> dict[str, Tensor]:
+    """Parameters of one Gaussian for each point, float32, on the device of ``points`` ``[N, 3]``; ``rgb`` is in [0, 1].
+
+    The standard deviation is the mean distance to the three nearest neighbours (3DGS, Kerbl et al. 2023); of coincident
+    points the smallest positive one. Points or colours that are not finite are dropped; ``DataError`` if all are.
+    """
+    finite = torch.isfinite(points).all(dim=1) & torch.isfinite(rgb).all(dim=1)
+    points, rgb, n = points[finite].float(), rgb[finite].float(), int(finite.sum())
+    if n == 0:
+        raise DataError("the point cloud holds no finite point; check the capture, or start with --random-init True")
+    width = points.new_ones(n)
+    if n > 1:
+        width = knn(points, min(3, n - 1)).distances.mean(dim=1).to(points)
+        positive = width[width > 0]
+        width = width.clamp_min(float(positive.min()) if len(positive) else 1e-3)
+    return {
+        "means": points.clone(),
+        "scales": width.log()[:, None].repeat(1, 3),
+        "quats": random_quaternions(n).to(points.device),
+        "features_dc": rgb_to_sh(rgb),
+        "features_rest": points.new_zeros(n, (sh_degree + 1) ** 2 - 1, 3),
+        "opacities": points.new_full((n, 1), 0.1).logit(),
+    }
+
+
+def random_quaternions(n: int) -> Tensor:
+    """Uniformly distributed unit quaternions ``[n, 4]`` (Shoemake, 1992)."""
+    u, v, w = torch.rand(3, n)
+    a, b = (1 - u).sqrt(), u.sqrt()
+    v, w = 2 * torch.pi * v, 2 * torch.pi * w
+    return torch.stack([a * v.sin(), a * v.cos(), b * w.sin(), b * w.cos()], dim=-1)
+
+
+def initial_features(features_dc: Tensor, num_features: int, generator: torch.Generator | None = None) -> Tensor:
+    """Initial feature vectors ``[N, F]``: small noise, plus ``features_dc`` ``[N, 3]`` in the first three channels."""
+    features = (0.05 * torch.randn(len(features_dc), num_features, generator=generator)).to(features_dc)
+    features[:, :3] += features_dc[:, :num_features]
+    return features
+
+
 def unit(direction: AnyArray) -> Direction:
     """A direction scaled to unit length; ``ConfigError`` for one without a direction."""
     x, y, z = numbers(direction, "the up axis", (3,)).tolist()
@@ -248,6 +285,13 @@ def usable_cameras(cameras: Any) -> tuple[Camera, ...]:
             if not isinstance(matrix, Tensor) or (matrix.device.type == "cpu" and not bool(matrix.isfinite().all())):
                 raise DataError("the matrices of a camera are no finite tensors; make it by Camera.from_pose")
     return listed
+
+
+def within(mask: Tensor, inner: Tensor) -> Tensor:
+    """Apply a mask ``inner`` ``[M]`` to the M true entries of a mask ``[N]``."""
+    narrowed = mask.clone()
+    narrowed[mask] = inner
+    return narrowed
 
 
 class Rendering(NamedTuple):
@@ -333,7 +377,6 @@ def measure(
     cameras = usable_cameras(cameras) if cameras is not None else stored or scene.cameras
     if not cameras:
         raise DataError("there is no view to measure in; give views, such as sundae_ns.virtual_cameras(scene)")
-    targets: Iterable[Tensor]
     if isinstance(reference, Scene):
         scene = dataclasses.replace(scene, background_color=reference.background_color)
         targets = (render(reference, camera, head=head, backend=backend).rgb for camera in cameras)

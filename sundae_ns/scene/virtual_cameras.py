@@ -118,21 +118,19 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
     ]
 
 
-def of_unit_size(scene: Scene, cameras: Sequence[Camera]) -> tuple[Scene, list[Camera]]:
-    """A scene of another program and its cameras at a size of 1: the near plane would hide a scene of millimetres."""
-    cameras, size = list(cameras), size_of(scene)
-    if size == 1:
-        return scene, cameras
-    for i, camera in enumerate(cameras):
+def of_unit_size(scene: Scene, cameras: Sequence[Camera]) -> tuple[Scene, list[Camera], float]:
+    """A scene and its cameras, on its device, at a size of 1, and its size: the near plane would hide millimetres.
+
+    The size is the median distance of the Gaussians from their middle; 1 for nerfstudio's model, which stays as it is.
+    """
+    size, scaled = 1.0 if scene.in_model_frame else middle_and_reach(usable(scene))[1], list[Camera]()
+    for camera in cameras:
         viewmat = camera.viewmat.clone()
         viewmat[:3, 3] /= size
-        cameras[i] = camera._replace(viewmat=viewmat)
-    return resized(scene, 1 / size), cameras
-
-
-def size_of(scene: Scene) -> float:
-    """The median distance of the Gaussians from their middle; 1 for nerfstudio's model, which keeps its size."""
-    return 1.0 if scene.in_model_frame else middle_and_reach(usable(scene))[1]
+        scaled.append(camera._replace(viewmat=viewmat).to(scene.device))
+    if size != 1:
+        scene = dataclasses.replace(scene, gaussians=resized(scene.gaussians, 1 / size), cameras=())
+    return scene, scaled, size
 
 
 def middle_and_reach(gaussians: Gaussians) -> tuple[Tensor, float]:
@@ -150,12 +148,11 @@ def split(cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:
     return [camera for i, camera in enumerate(cameras) if i % 8], list(cameras[::8])
 
 
-def resized(scene: Scene, factor: float) -> Scene:
-    """The scene, without its stored cameras, ``factor`` times as large."""
+def resized(gaussians: Gaussians, factor: float) -> Gaussians:
+    """The Gaussians, ``factor`` times as large."""
     if factor == 1:
-        return scene
-    values = {"means": scene.gaussians["means"] * factor, "scales": scene.gaussians["scales"] + math.log(factor)}
-    return dataclasses.replace(scene, gaussians=scene.gaussians.replaced(values), cameras=())
+        return gaussians
+    return gaussians.replaced({"means": gaussians["means"] * factor, "scales": gaussians["scales"] + math.log(factor)})
 
 
 def usable(scene: Scene) -> Gaussians:

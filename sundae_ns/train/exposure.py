@@ -83,7 +83,7 @@ class ExposureCompensation(Callback):
                 log.warning(f"exposure-compensation is off: {len(indices)} {few}")
             return
         self._state, self._rows = run.state, np.asarray(indices)
-        positions = places([view.camera for view in run.training_views()]).cpu()
+        positions = places([camera for camera, _ in run.training_views()]).cpu()
         self._smoother = Smoother(build_graph(positions, num_neighbors=NEIGHBORS), SMOOTHING)
         if run.images_per_step > 1:  # of the first rank alone
             self._sums.zero_()

@@ -23,7 +23,7 @@ from sundae_ns.cuda.adam import Update, adam_step
 from sundae_ns.cuda.cuda_graphs import record, warm_up
 from sundae_ns.rasterize.gsplat_backend import RecordableGsplat
 from sundae_ns.rasterize.gsplat_kernels import Capacity
-from sundae_ns.scene.render import GaussianSource, RenderSettings, degree_in_use
+from sundae_ns.scene.render import GaussianSource, RenderSettings
 from sundae_ns.train.densification import COUNTED, STATISTICS, count_view, start_counting
 from sundae_ns.train.state import TrainingState
 from sundae_ns.train.step import StepInputs, StepLosses, StepResult, training_step
@@ -360,7 +360,7 @@ class RecordedStep:
 def _kind(state: TrainingState, inputs: StepInputs, settings: RenderSettings) -> Hashable:
     """What decides on the kernels of a step, beside numbers of Gaussians."""
     camera, head = inputs.camera, settings.head
-    degree = degree_in_use(state.gaussians.sh_degree, settings.active_sh_degree)
+    degree = min(state.gaussians.sh_degree, settings.active_sh_degree)
     return (
         (camera.width, camera.height, inputs.mask is not None, degree, settings.antialiased, settings.absgrad),
         (state.densifying, state.pruned, state.head_enabled),

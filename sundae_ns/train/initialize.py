@@ -23,7 +23,7 @@ from sundae_ns.core.surgery import replace_parameter
 from sundae_ns.io.coordinates import similarity
 from sundae_ns.io.formats import kind_of, read_gaussians
 from sundae_ns.pruning.selection import neighbor_order, select_systematic
-from sundae_ns.scene.initialization import from_points, initial_features, random_points
+from sundae_ns.scene.scene import from_points, initial_features
 from sundae_ns.scene.virtual_cameras import by_device
 from sundae_ns.train.plane_sweep import Sweep
 from sundae_ns.train.state import Callback, TrainingRun, TrainingState
@@ -65,20 +65,20 @@ def initial_gaussians(
     start = Start()
     try:
         if options.warm_start is None:
-            params, start = _sparse_gaussians(options, points, num_features, cap)
+            params, start = _sparse_gaussians(options, points, cap)
         else:
-            params = _warm_gaussians(options, options.warm_start, frame, num_features)
+            params = _warm_gaussians(options, options.warm_start, frame)
     except CheckpointError as error:
-        params, start = _sparse_gaussians(options, points, num_features, cap)[0], Start(failure=error)
+        params, start = _sparse_gaussians(options, points, cap)[0], Start(failure=error)
+    if num_features:
+        params[FEATURES] = initial_features(params["features_dc"], num_features)
     if options.sh_degree == 0:
         # splatfacto and nerfstudio's exporter store logits of colours at SH degree 0.
         params["features_dc"] = rgb_to_logit(sh_to_rgb(params["features_dc"]))
     return params, start
 
 
-def _sparse_gaussians(
-    options: Any, points: Points | None, num_features: int, cap: int | None
-) -> tuple[dict[str, Tensor], Start]:
+def _sparse_gaussians(options: Any, points: Points | None, cap: int | None) -> tuple[dict[str, Tensor], Start]:
     warnings: list[str] = []
     if points is not None and len(points[0]) > 0 and not options.random_init:
         xyz, rgb = points[0], points[1].float() / 255 if len(points[1]) else torch.full_like(points[0], 0.5)
@@ -90,16 +90,16 @@ def _sparse_gaussians(
             better = "Results are better with one (COLMAP, or ply_file_path in transforms.json)."
             none = f"the capture has no sparse point cloud; starting from {options.num_random} random points"
             warnings.append(f"{none}. {better}")
-        xyz, rgb = random_points(options.num_random, options.random_scale)
+        xyz = (torch.rand(options.num_random, 3) - 0.5) * options.random_scale
+        rgb = torch.rand_like(xyz)
     if cap is not None and len(xyz) > cap:
         warnings.append(f"{len(xyz):,} points are more than the cap; starting from {cap:,} of them")
         chosen = torch.randperm(len(xyz), generator=torch.Generator().manual_seed(options.pruning.seed))[:cap]
         xyz, rgb = xyz[chosen], rgb[chosen]
-    params = from_points(xyz, rgb, sh_degree=options.sh_degree, num_features=num_features)
-    return params, Start(tuple(warnings))
+    return from_points(xyz, rgb, sh_degree=options.sh_degree), Start(tuple(warnings))
 
 
-def _warm_gaussians(options: Any, source: Path, frame: Frame | None, num_features: int) -> dict[str, Tensor]:
+def _warm_gaussians(options: Any, source: Path, frame: Frame | None) -> dict[str, Tensor]:
     params, in_model_frame = read_gaussians(source)
     if options.warm_start_frame != "auto":
         in_model_frame = options.warm_start_frame == "model"
@@ -118,8 +118,6 @@ def _warm_gaussians(options: Any, source: Path, frame: Frame | None, num_feature
     rest = params["features_rest"][:, :columns]
     missing = rest.new_zeros(len(rest), columns - rest.shape[1], 3)
     params["features_rest"] = torch.cat([rest, missing], dim=1)
-    if num_features:
-        params[FEATURES] = initial_features(params["features_dc"], num_features)
     log.info(f"warm start: {len(params['means'])} Gaussians from {source}")
     return params
 

@@ -339,7 +339,7 @@ class FloaterRemoval(Callback):
             return
         self._done = True
         assert self._points is not None
-        if not (eyes := [view.camera.center for view in run.training_views()]):
+        if not (eyes := [camera.center for camera, _ in run.training_views()]):
             return
         pruner = Pruner(state.gaussians, state.optimizers, [state.densification])
         if removed := pruner.drop(near_cameras(pruner.params["means"], torch.stack(eyes), self._points), at_most=MOST):

@@ -17,7 +17,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from sundae_ns.core.camera import Camera
-from sundae_ns.core.gaussians import FEATURES, Gaussians
+from sundae_ns.core.gaussians import FEATURES, MAX_SH_DEGREE, Gaussians
 from sundae_ns.core.surgery import Snapshot, module_snapshot, restore, restore_module, snapshot
 from sundae_ns.head.head import CompensationHead
 from sundae_ns.rasterize.types import Backend
@@ -74,11 +74,6 @@ class TrainingState:
         return self.pruning.get("num_prunes", 0) > 0 and not self.densifying
 
     @property
-    def active_sh_degree(self) -> int | None:
-        """Highest SH degree in use; None for the degree of the field."""
-        return None if self.sh_degree_interval is None else self.step // max(self.sh_degree_interval, 1)
-
-    @property
     def head(self) -> CompensationHead | None:
         """The head; None if the field has none."""
         return self.networks["head"] if "head" in self.networks else None  # type: ignore[return-value]
@@ -110,9 +105,10 @@ class TrainingState:
         self, backend: Backend, *, antialiased: bool, training: bool = False, absgrad: bool = False
     ) -> RenderSettings:
         """Render settings at this step; ``absgrad`` says whether densification reads absolute gradients."""
+        interval = self.sh_degree_interval
         return RenderSettings(
             backend=backend,
-            active_sh_degree=self.active_sh_degree,
+            active_sh_degree=MAX_SH_DEGREE if interval is None else self.step // max(interval, 1),
             antialiased=antialiased,
             training=training,
             absgrad=absgrad and training and self.densifying,

@@ -40,8 +40,8 @@ from sundae_ns.io.coordinates import scene_order
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
 from sundae_ns.pruning.decision import Pruner
 from sundae_ns.pruning.rule import kept_count
-from sundae_ns.scene.initialization import initial_features
 from sundae_ns.scene.render import contribution, render_view
+from sundae_ns.scene.scene import initial_features
 from sundae_ns.train import choice
 from sundae_ns.train.averaging import AVERAGED_EVERY, RunningMean, weights_of
 from sundae_ns.train.choice import HEADS, HeadGain, HeldOutQuality, Tolerance, Tried, mean_quality

@@ -8,6 +8,7 @@ import pytest
 import torch
 from command_line import run
 from numpy.lib.recfunctions import append_fields
+from PIL import Image
 from plyfile import PlyData, PlyElement
 
 import sundae_ns as sn
@@ -70,6 +71,25 @@ def test_export_to_a_page_and_to_other_formats(folder, tmp_path):
     assert sn.load(tmp_path / "b.ply").num_gaussians == found.num_gaussians
     cut = sn.load(tmp_path / "c.spz").gaussians["means"]
     assert len(cut) == int((sn.load(folder / "packed.sundae").gaussians["means"][:, 0] <= 0.5).sum())
+
+
+def test_a_preview_shows_what_cleaning_changes_most(folder, tmp_path, capsys):
+    """Both images side by side, by the camera that sees most of what goes."""
+    words, shown = ("export", folder / "packed.sundae", "-o"), tmp_path / "shown.png"
+    assert run(*words, tmp_path / "a.spz", "--preview", shown) == 2
+    assert "--preview shows what --remove-floaters changes" in capsys.readouterr().err
+    assert run(*words, tmp_path / "a.spz", "--preview", shown, "--remove-floaters") == 0
+    before = sn.load(folder / "packed.sundae")
+    pairs = [
+        [sn.render(each, camera).rgb for each in (before, sn.remove_floaters(before))] for camera in before.cameras
+    ]
+    most = max(pairs, key=lambda pair: float((pair[0] - pair[1]).square().mean()))
+    found = np.asarray(Image.open(shown), np.float32) / 255
+    np.testing.assert_allclose(found, torch.cat(most, dim=1).numpy(), atol=0.01)
+    assert found.shape == (48, 128, 3)
+    assert np.abs(found[:, :64] - found[:, 64:]).max() > 0.05
+    assert run(*words, tmp_path / "b.spz", "--preview", shown, "--remove-floaters") == 2
+    assert f"{shown} exists" in capsys.readouterr().err
 
 
 def test_prune_keeps_a_share_of_what_remains(folder, tmp_path, capsys):

@@ -24,17 +24,17 @@ from sundae_ns.io.pack.packed_scene import PackedScene, read_scene, write_scene
 from sundae_ns.io.ply import MODEL_FRAME, Marks, ply_marks, read_ply, write_ply
 from sundae_ns.io.spz import clamped
 from sundae_ns.scene import prune_scene as pruning
-from sundae_ns.scene.initialization import from_points
+from sundae_ns.scene.scene import from_points
 
 MODEL = {"sh_degree": 1, "rasterize_mode": "classic", "background_color": "black"}
 
 
 def gaussians(n=200, features=0):
-    generator = torch.Generator().manual_seed(0)
-    points = torch.rand(n, 3, generator=generator)
-    made = from_points(points, points, sh_degree=1, num_features=features, generator=generator)
-    made["features_rest"] = torch.randn(n, 3, 3, generator=generator)
-    return made
+    torch.manual_seed(0)
+    points = torch.rand(n, 3)
+    made = from_points(points, points, sh_degree=1)
+    made["features_rest"] = torch.randn(n, 3, 3)
+    return made | ({"features": torch.randn(n, features)} if features else {})
 
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])

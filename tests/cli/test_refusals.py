@@ -42,7 +42,7 @@ REFUSALS = {
     "prune a.ksplat -o a.ply": "a.ksplat is not a complete .ksplat (",
     "prune trained -o a.ply": "trained is a folder of 3DGS; give trained/point_cloud/iter",
     "prune in.ply -o b.ply --distill": "b.ply cannot hold a head; name it .sundae, or leave",
-    "prune in.ply -o b.sundae --distill --steps 0": "steps is 0; give 1 or more",
+    "prune in.ply -o b.sundae --distill --steps 0": "steps is 0; give a whole number, at least 1",
     "prune in.ply -o b.sundae --distill --max-mb 1": "--distill and --max-mb exclude each other",
     "prune in.ply -o b.ply --keep 0.1 --max-mb 1": "--keep and --max-mb exclude each other",
     "prune in.ply -o b.html --max-mb 0.01": "a file without Gaussians has",

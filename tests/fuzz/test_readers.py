@@ -30,7 +30,7 @@ from run_commands import write_video
 from small_captures import meta_of
 
 import sundae_ns as sn
-from sundae_ns.core.errors import DataError, PackError, SundaeError
+from sundae_ns.core.errors import PackError, SundaeError
 from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.data.images import reads_heif
 from sundae_ns.data.photos import photo_of, upright
@@ -41,7 +41,7 @@ from sundae_ns.io.pack import container
 from sundae_ns.io.pack.packed_scene import PackedScene, read_scene, write_scene
 from sundae_ns.io.ply import Marks, read_ply, read_point_cloud, write_ply
 from sundae_ns.plugin.dataparsers import LightNerfstudioParser, check_capture
-from sundae_ns.scene.initialization import from_points
+from sundae_ns.scene.scene import from_points
 
 HEADER = b"ply\nformat %s 1.0\nelement vertex %s\n%send_header\n"
 XYZ = b"property float x\nproperty float y\nproperty float z\n"
@@ -62,7 +62,7 @@ def write_cloud(path, text):
 def read_cloud(path):
     points, rgb = read_point_cloud(path)
     if torch.isfinite(points).all(dim=1).any():
-        from_points(points, rgb.float() / 255, sh_degree=1, num_features=0)
+        from_points(points, rgb.float() / 255, sh_degree=1)
 
 
 def write_lod(path):
@@ -94,15 +94,9 @@ def write_clip(path):
 
 
 def read_video(path):
+    check_video(path)
     shutil.rmtree(path.with_suffix(""), ignore_errors=True)
-    error = None
-    try:
-        check_video(path)
-        write_frames(path, path.with_suffix(""), 3, lambda _: None)
-    except DataError as raised:
-        error = str(raised)
-    if error is not None:  # without its cause: FFmpeg calls absurd counts a lack of memory, which it does not ask for
-        raise DataError(error)
+    write_frames(path, path.with_suffix(""), 3, lambda _: None)
 
 
 WRITERS = FOREIGN | dict.fromkeys(("a.spz", "a.sog", "a.glb"), write_for_viewers)

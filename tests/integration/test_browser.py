@@ -4,6 +4,8 @@ Screenshots are compared with pictures of the loaded model by the page's own cam
 and the browser's enlarging to the size of its canvas, done here by the same bilinear filter.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -126,7 +128,7 @@ def test_every_control_does_what_it_says(tiny, server, page):
     weights = model.contribution(pipeline.datamanager, count if rule.uses_detail else None)
     pruned = prune_gaussians(model.state.gaussians, rule, count, weights)
     assert pruned.decision.values is not None
-    settings = model.render_settings(training=False).without_head()
+    settings = replace(model.render_settings(training=False), head=None)
     with torch.no_grad():
         preview, _ = render_view(
             GaussianSource(pruned.gaussians), model.camera_of(camera_of(page)), expected["background"][0, 0], settings

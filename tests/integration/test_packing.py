@@ -12,7 +12,7 @@ from command_line import run
 from kill_and_resume import contents
 
 from sundae_ns.cli.pack import PackDetails, pack
-from sundae_ns.core.errors import CheckpointError, ConfigError, MemoryExhaustedError, PackError
+from sundae_ns.core.errors import CheckpointError, ConfigError, MemoryExhaustedError
 from sundae_ns.core.metrics import Quality, psnr
 from sundae_ns.io.formats import read_gaussians
 from sundae_ns.io.pack.codecs import Transform
@@ -21,9 +21,9 @@ from sundae_ns.io.pack.container import read_header
 from sundae_ns.io.pack.packed_scene import fit_scene, pack_bytes, read_scene, write_fitted
 from sundae_ns.plugin import tuned_packs
 from sundae_ns.plugin.finished_runs import load_model, load_run
+from sundae_ns.plugin.optimizer_configs import rate_factor
 from sundae_ns.plugin.tuned_packs import COARSEST, Candidate, RoundedTraining, Search, best_pack, finetune, scaled
 from sundae_ns.scene.load_save import load
-from sundae_ns.scene.optimise import rate_factor
 from sundae_ns.scene.packing import contents_of
 
 
@@ -198,7 +198,7 @@ def test_a_target_is_never_larger_than_a_default_that_meets_it(scene):
     by_chance = search(scene, lambda config: 0.06 if config.harmonics_step == 0.02 else 0.3)
     default, found = by_chance.default, by_chance.better_than(0.2)
     assert (found.bytes, by_chance.drop(found)) == (default.bytes, pytest.approx(0.06))
-    with pytest.raises(PackError, match=r"the finest pack loses 0\.300 dB"):
+    with pytest.raises(ConfigError, match=r"the finest pack loses 0\.300 dB"):
         by_chance.better_than(0.01)
     assert by_chance.smaller_than(int(1.2 * default.bytes)).bytes == default.bytes
 
@@ -229,7 +229,7 @@ def test_a_fine_tune_that_does_not_help_is_left_out(scene, tuned, drop, helps):
         assert (found.scene is tuned.scene) == helps
         assert found.bytes <= limit.get("most_bytes", most)
     if not helps:
-        with pytest.raises(PackError, match=r"the finest pack loses 0\.500 dB"):
+        with pytest.raises(ConfigError, match=r"the finest pack loses 0\.500 dB"):
             best_pack([other, plain], most_drop=0.0001)
 
 
@@ -247,7 +247,7 @@ def test_targets_that_cannot_be_met(tiny, scene, tmp_path, capsys):
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert re.search("a file without Gaussians has .* bytes; give more than 1,000", line)
     assert not list(tmp_path.iterdir())
-    with pytest.raises(PackError, match=r"finest pack loses 0\.50* dB at [\d,]+ bytes; give a larger --target-drop"):
+    with pytest.raises(ConfigError, match=r"finest pack loses 0\.50* dB at [\d,]+ bytes; give a larger --target-drop"):
         search(scene, lambda _: 0.5, scaled(PackConfig(), COARSEST)).better_than(0.1)
 
 

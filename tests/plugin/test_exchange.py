@@ -24,12 +24,12 @@ from sundae_ns.plugin.optimizer_configs import FusedAdamConfig
 from sundae_ns.rasterize.interface import rasterize, select_backend
 from sundae_ns.rasterize.reference import project
 from sundae_ns.rasterize.types import Inputs
-from sundae_ns.scene.render import ColorSettings, GaussianSource, may_be_seen
+from sundae_ns.scene.render import GaussianSource, RenderSettings, may_be_seen
 from sundae_ns.train.exposure import ExposureCompensation
 from sundae_ns.train.state import Callback, TrainingState
 
 REFERENCE = select_backend("reference", "cpu")
-COLORS = ColorSettings(REFERENCE)
+COLORS = RenderSettings(REFERENCE)
 N, RANKS = 90, 2
 
 

@@ -1,6 +1,7 @@
 """The preview of a prune in the viewer: what it shows, and that it changes nothing."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import get_args
 
@@ -102,7 +103,7 @@ def test_exactly_the_share_is_shown(rule, keep_ratio):
 
 def image_of(model, source, background):
     """The base colours of a source, over a background ``[H, W, 3]`` of one colour."""
-    settings = model.render_settings(training=False).without_head()
+    settings = replace(model.render_settings(training=False), head=None)
     return render_view(source, model.camera_of(camera()), background[0, 0], settings)[0]["rgb"]
 
 

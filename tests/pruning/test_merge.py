@@ -14,7 +14,7 @@ from sundae_ns.pruning import merge
 from sundae_ns.pruning.decision import prune_gaussians
 from sundae_ns.pruning.merge import gaussian_graph, pair_labels, voronoi_labels
 from sundae_ns.pruning.rule import PruneRule
-from sundae_ns.scene.initialization import from_points
+from sundae_ns.scene.scene import from_points
 
 PAIRS = PruneRule()
 WEIGHTS = torch.linspace(0.1, 1, 300)
@@ -133,7 +133,7 @@ def test_a_merge_on_the_gpu_gives_the_same_values():
 
 def points(n=400):
     places, colors = torch.rand(2, n, 3, generator=torch.Generator().manual_seed(0))
-    return Gaussians(from_points(places, colors, sh_degree=1, num_features=0))
+    return Gaussians(from_points(places, colors, sh_degree=1))
 
 
 def graph_of(gaussians):
@@ -144,7 +144,7 @@ def row(*places, colors=None):
     """Gaussians of width 0.5 along the x axis, grey unless colours are given."""
     means = torch.tensor([[place, 0.0, 0.0] for place in places])
     colors = torch.full_like(means, 0.5) if colors is None else colors
-    params = from_points(means, colors, sh_degree=0, num_features=0)
+    params = from_points(means, colors, sh_degree=0)
     return Gaussians({**params, "scales": torch.full_like(means, 0.5).log()})
 
 

@@ -58,7 +58,7 @@ def test_a_transforms_file_and_a_camera_path(tmp_path):
     # The camera looks along -z, so the origin is in the middle of the image.
     seen = first.K @ first.viewmat[:3, 3]
     torch.testing.assert_close(seen[:2] / seen[2], torch.tensor([32.0, 24.0]))
-    assert read_cameras(path).frames_per_second is None
+    assert read_cameras(path)[1] is None
     (camera,), speed = read_cameras(written(tmp_path, PATH))
     assert speed == 12
     assert float(camera.K[1, 1]) == pytest.approx(24)
@@ -106,7 +106,7 @@ def test_cameras_of_a_capture_move_with_its_model(tmp_path):
         ({**LENS, "frames": [{}]}, "transform_matrix"),
         ({**LENS, "frames": [7]}, "transform_matrix"),
         ({**LENS, "w": 0, "frames": [FRAME]}, "w is 0"),
-        ({**PATH, "camera_path": []}, "empty camera_path"),
+        ({**PATH, "camera_path": []}, "neither frames nor a camera_path"),
         ({**PATH, "camera_type": "equirectangular"}, "equirectangular"),
         ({**PATH, "camera_path": [{"camera_to_world": [1, 2]}]}, "camera_to_world"),
         ({**PATH, "camera_path": [{**KEY, "fov": 200}]}, "below 180"),

@@ -8,7 +8,7 @@ import torch
 
 import sundae_ns as sn
 from sundae_ns.core.errors import ConfigError, DataError
-from sundae_ns.scene.prune_scene import crop_mask, floater_mask
+from sundae_ns.scene.compose import crop_mask, floater_mask
 
 VIEWS = tuple(sn.Camera.look_at((x, -4.0, 1.0), (0.0, 0.0, 0.0), fov=60, width=96, height=72) for x in (-2.0, 0.0, 2.0))
 

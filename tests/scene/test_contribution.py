@@ -12,7 +12,7 @@ from sundae_ns.core.errors import DataError
 from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.pruning.scores import pixel_detail
 from sundae_ns.rasterize.interface import blending_weights, rasterize
-from sundae_ns.scene.render import GaussianSource, TrainingCamera, contribution, pass_inputs
+from sundae_ns.scene.render import GaussianSource, contribution, pass_inputs
 
 N = 60  # Gaussians of a model that is built without a count
 
@@ -60,9 +60,7 @@ def test_weights_by_detail_are_those_of_an_image_and_a_second_pass(masked):
     scene = sn.Scene(Gaussians(random_field(60, features=0)))
     camera, settings = sn.virtual_cameras(scene, 1, size=40)[0], scene.settings()
     mask = torch.rand(40, 40, 1, generator=torch.Generator().manual_seed(0)) < 0.5 if masked else None
-    found = contribution(
-        GaussianSource(scene.gaussians), [TrainingCamera(camera, mask)], scene.background, settings, 20
-    )
+    found = contribution(GaussianSource(scene.gaussians), [(camera, mask)], scene.background, settings, 20)
     image = sn.render(scene, camera)
     visible = rasterize(pass_inputs(scene.gaussians, camera, settings), backend=settings.backend).radii > 0
     pixels = pixel_detail(image.rgb, 20 / 60 * float(visible.sum()))

@@ -15,7 +15,7 @@ from sundae_ns.core.errors import BackendError
 from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.cuda.cuda_graphs import RECORD_AT
 from sundae_ns.scene import frames
-from sundae_ns.scene.frames import FrameReplay, Later, LazyOutputs
+from sundae_ns.scene.frames import FrameReplay, LazyOutputs
 from sundae_ns.scene.render import GaussianSource, render_view
 
 
@@ -53,10 +53,10 @@ def test_an_output_is_made_once_by_every_way_to_it_and_without_gradients():
         calls.append(name)
         return 2 * weight
 
-    outputs = LazyOutputs(rgb="RGB", depth=Later(lambda: make("depth")), features=Later(lambda: make("features")))
+    outputs = LazyOutputs(rgb="RGB", depth=lambda: make("depth"), features=lambda: make("features"))
     for look in (dict, lambda o: {**o}, lambda o: dict(o.items()), lambda o: dict(zip(o, o.values(), strict=True))):
         assert look(copy.copy(outputs)) == {"rgb": "RGB", "depth": 2, "features": 2}
-    assert isinstance(outputs.data["depth"], Later)
+    assert callable(outputs.data["depth"])
     calls.clear()
     assert not any(value.requires_grad for value in (outputs["depth"], outputs["depth"], outputs.get("depth")))
     assert calls == ["depth"]
@@ -66,7 +66,7 @@ def test_an_output_is_made_once_by_every_way_to_it_and_without_gradients():
 
 def test_two_threads_get_values():
     barrier = Barrier(2, timeout=10)  # both are in it before either has its value
-    outputs = LazyOutputs(x=Later(lambda: barrier.wait() >= 0))
+    outputs = LazyOutputs(x=lambda: barrier.wait() >= 0)
     with ThreadPoolExecutor(2) as pool:
         assert list(pool.map(lambda _: outputs["x"], range(2))) == [True, True]
 

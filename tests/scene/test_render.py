@@ -1,5 +1,6 @@
 """Images of the model: its outputs, crops, the background, other scales, and full memory."""
 
+from dataclasses import replace
 from unittest.mock import Mock
 
 import pytest
@@ -82,7 +83,7 @@ def test_a_crop_without_primitives_has_the_same_keys(model, camera):
 def test_without_the_head_the_picture_is_the_base_exactly(model, camera):
     on = model.get_outputs_for_camera(camera())
     assert (on["rgb"] - on["base_rgb"]).abs().max() > 1e-3
-    settings = model.render_settings(training=False).without_head()
+    settings = replace(model.render_settings(training=False), head=None)
     off, _ = render_view(model.source, model.camera_of(camera()), on["background"], settings)
     assert torch.equal(off["rgb"], off["base_rgb"])
     # With features in the same pass the sums are taken in another order.

@@ -21,10 +21,9 @@ from sundae_ns.io.pack import container
 from sundae_ns.io.pack.codecs import Sensitivity
 from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.io.pack.packed_scene import PackedScene, write_scene
-from sundae_ns.scene.initialization import from_points
 from sundae_ns.scene.load_save import load
 from sundae_ns.scene.packing import contents_of
-from sundae_ns.scene.scene import Background, Scene
+from sundae_ns.scene.scene import Background, Scene, from_points, initial_features
 
 WIDTH, HEIGHT = 50, 37
 FOCAL = 45.0
@@ -76,8 +75,8 @@ def write_kind(path: Path, kind: Kind) -> Path:
     n = kind.points
     points = torch.rand(n, 3) - 0.5
     features = kind.head.num_features if kind.head else 3
-    gaussians = from_points(points, torch.rand(n, 3), sh_degree=kind.degree, num_features=features)
-    gaussians = {name: value.detach().clone() for name, value in gaussians.items()}
+    gaussians = from_points(points, torch.rand(n, 3), sh_degree=kind.degree)
+    gaussians["features"] = initial_features(gaussians["features_dc"], features)
     gaussians["features_rest"] = 0.2 * torch.randn(n, (kind.degree + 1) ** 2 - 1, 3)
     gaussians["features"] = torch.randn(n, features)
     gaussians["quats"] = torch.randn(n, 4)

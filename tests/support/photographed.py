@@ -21,7 +21,7 @@ def ring(count=COUNT):
 
 def run_of(cameras, *, ranks=1):
     indices = list(range(len(cameras)))
-    shown = [SimpleNamespace(camera=camera, mask=None) for camera in cameras]
+    shown = [(camera, None) for camera in cameras]
     members = {"view_indices": lambda: indices, "training_views": lambda: shown, "images_per_step": ranks}
     return SimpleNamespace(state=SimpleNamespace(step=0), **members)
 

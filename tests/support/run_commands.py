@@ -19,7 +19,7 @@ from photos import photo
 
 from sundae_ns import method_configs
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
-from sundae_ns.scene.initialization import from_points
+from sundae_ns.scene.scene import from_points
 
 PHOTOS = 8
 STEPS = ["sundae poses", "ns-train", "sundae pack", "sundae compare", "sundae export"]
@@ -115,7 +115,7 @@ def write_run(
 def packed() -> bytes:
     points = torch.linspace(0, 1, 30).reshape(10, 3)
     model = {"sh_degree": 0, "rasterize_mode": "classic", "background_color": "black"}
-    scene = PackedScene(from_points(points, points, sh_degree=0, num_features=0), meta={"model": model})
+    scene = PackedScene(from_points(points, points, sh_degree=0), meta={"model": model})
     return pack_bytes(*fit_scene(scene))[0]
 
 
