@@ -26,6 +26,7 @@ def optimizers(steps: int, *, plain: bool = False) -> dict[str, Any]:
     out what is not in the paper: this restart, and weight decay of the head.
     """
     rates = {**configs.RATES, "camera_opt": 1e-4}
+    rates["features_rest"] *= configs.HARMONICS_EVERY
     groups: dict[str, Any] = {
         name: {"optimizer": configs.FusedAdamConfig(lr=rate, eps=1e-15), "scheduler": None}
         for name, rate in rates.items()
@@ -59,7 +60,6 @@ def method(
     cuda = torch.cuda.is_available()
     camera_optimizer = CameraOptimizerConfig(mode="off")
     options: dict[str, Any] = {
-        "steps_per_eval_image": 500,
         "steps_per_eval_batch": 0,
         "steps_per_save": 2000,
         "steps_per_eval_all_images": 5000,
@@ -93,8 +93,8 @@ def method(
 
 
 def _keep(percent: int) -> MethodSpecification:
-    description = f"SUNDAE that keeps {percent}% of the Gaussians, with a head where it pays."
-    return method(f"sundae-{percent}", description, PruningConfig(keep_ratio=percent / 100))
+    line = f"SUNDAE that keeps {percent}% of the Gaussians, with a head where it pays."
+    return method(f"sundae-{percent}", line, PruningConfig(keep_ratio=percent / 100))
 
 
 # The paper's ratios; --pipeline.model.pruning.keep-ratio takes any other.

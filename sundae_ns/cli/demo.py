@@ -27,5 +27,5 @@ def demo(out: Source = Path(".demo"), steps: Int = None, overwrite: Overwrite = 
     project = Project(out / "scene", out, train=train, more=more)
     with writing(f"cannot write to {out}"):
         write_demo_capture(project.photos)
-        shutil.rmtree(out / "runs", ignore_errors=True)  # of an earlier demo
+        shutil.rmtree(project.run, ignore_errors=True)  # of an earlier demo
     return carry_out(project)

@@ -62,7 +62,6 @@ extern "C" __global__ void harmonic_colors_backward(
     if (first >= n) return;
     const int count = n - first < PER_BLOCK ? (int)(n - first) : PER_BLOCK, stride = 3 * num_rest;
     const float* from = rest + first * stride;
-    float* to = grad_rest + first * stride;
     for (int k = threadIdx.x; k < count * stride; k += blockDim.x) coefficients[k] = from[k];
     __syncthreads();
     for (int p = threadIdx.x; p < count; p += blockDim.x) {
@@ -123,6 +122,8 @@ extern "C" __global__ void harmonic_colors_backward(
         grad_means[3 * i + 1] = reach * (dy - along * y);
         grad_means[3 * i + 2] = reach * (dz - along * z);
     }
+    if (!grad_rest) return;  // the coefficients are not trained
     __syncthreads();
+    float* to = grad_rest + first * stride;
     for (int k = threadIdx.x; k < count * stride; k += blockDim.x) to[k] = coefficients[k];
 }

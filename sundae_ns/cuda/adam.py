@@ -1,7 +1,7 @@
 """Adam with the learning rates in memory, so that a CUDA graph can record it; one kernel for a parameter.
 
-torch's fused Adam gives each block of threads 65,536 numbers. A pruned scene has a few such pieces for a parameter, and
-most of the GPU waits; here a block has 1,024.
+torch's fused Adam gives each block of threads 65,536 numbers of a tensor. A pruned scene has a few such pieces for a
+parameter, and a head ten, so most of the GPU waits. Here a block has 1,024, and torch gets the weights in small pieces.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from torch import Tensor
 from sundae_ns.cuda.kernels import load_kernels
 
 _THREADS, _PER_THREAD = 256, 4
+_PIECE = 8192  # numbers
 
 OPTIONS = (f"-DPER_THREAD={_PER_THREAD}",)  # Compiler options of ``adam.cu``
 
@@ -43,7 +44,12 @@ def adam_step(groups: Sequence[tuple[Mapping[str, Any], Sequence[Update]]], rate
         if len(updates) == 1 and updates[0].value.is_cuda and options["weight_decay"] == 0:
             adam(updates[0], rate, skip, betas=(beta1, beta2), eps=options["eps"])
         elif updates:
-            values, gradients, means, squares, counts = map(list, zip(*updates, strict=True))
+            pieces = [
+                (*piece, update.step)
+                for update in updates
+                for piece in zip(*(each.as_strided((each.numel(),), (1,)).split(_PIECE) for each in update[:4]))
+            ]
+            values, gradients, means, squares, counts = map(list, zip(*pieces, strict=True))
             update = torch._fused_adamw_ if options.get("decoupled_weight_decay") else torch._fused_adam_
             update(
                 *(values, gradients, means, squares, [], counts),

@@ -13,7 +13,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from sundae_ns.core.errors import DataError, SundaeError
+from sundae_ns.core.errors import SundaeError
 from sundae_ns.core.metrics import SSIM_WINDOW
 from sundae_ns.cuda.kernels import Launch, load_kernels
 
@@ -44,16 +44,10 @@ def fused_loss(
 
     L1 is the mean over all values, with ``l1_weight`` if it is given. SSIM is pytorch_msssim's, over windows inside the
     image, with a data range of 1. All images are float32 on a CUDA device ``[H, W, 3]``, both sides at least
-    :data:`SSIM_WINDOW`; the target gets no gradient. ``BackendError`` if the kernels cannot be compiled or loaded,
-    ``DataError`` if the images differ in shape, are too small, or are not float32.
+    :data:`SSIM_WINDOW`; the target gets no gradient. ``BackendError`` if the kernels cannot be compiled or loaded.
     """
-    for each in (image,) if base is None else (image, base):
-        same_kind = each.shape == target.shape and each.dtype == target.dtype == torch.float32
-        if not same_kind or each.shape[2:] != (3,) or min(each.shape[:2]) < SSIM_WINDOW:
-            raise DataError(
-                f"the fused loss cannot compare {each.dtype} {list(each.shape)} with {target.dtype} "
-                f"{list(target.shape)}; pass float32 [H, W, 3] of one size, at least {SSIM_WINDOW} px per side"
-            )
+    kinds = {(each.shape, each.dtype) for each in (image, target, base) if each is not None}
+    assert kinds == {(target.shape, torch.float32)}
     weights = (1 - weight if l1_weight is None else l1_weight, weight)
     return cast("tuple[Tensor, Tensor | None]", _Loss.apply(image, base, target.detach(), weights))
 

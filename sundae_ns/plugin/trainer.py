@@ -33,7 +33,7 @@ from sundae_ns.plugin import distributed
 from sundae_ns.plugin.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
 from sundae_ns.plugin.dataparsers import check_capture, warn_of_other_frame
 from sundae_ns.plugin.model import SundaeModel
-from sundae_ns.plugin.optimizer_configs import FusedAdamConfig
+from sundae_ns.plugin.optimizer_configs import HARMONICS_EVERY, FusedAdamConfig
 from sundae_ns.plugin.viewer import stop_rendering
 from sundae_ns.train.graphed_step import RecordedStep
 from sundae_ns.train.progress import Interruption, loaded_run, long_on_cpu, resume_command, warn
@@ -65,8 +65,7 @@ class SundaeTrainerConfig(TrainerConfig):
 
         set_schedule(self, all_methods.get(str(self.method_name)), sys.argv[1:])
         whole = "" if self.schedule_length == self.max_num_iterations else f" of {self.schedule_length:,}"
-        title = f"{self.max_num_iterations:,}{whole} steps"
-        table = Table("part of training", "steps", title=title, title_justify="left")
+        table = Table("part of training", f"{self.max_num_iterations:,}{whole} steps")
         for row in schedule_table(self):
             table.add_row(*row)
         CONSOLE.print(table)
@@ -134,8 +133,8 @@ class SundaeTrainer(Trainer):
             CONSOLE.print(NOTHING_SAVED)
             raise SystemExit(130) from None
         self.ranks.share(self.model, self.pipeline.datamanager, self.optimizers)
-        if self._recordable():
-            self._recorded = RecordedStep(self.model.losses)
+        self.model.state.harmonics_every = HARMONICS_EVERY * self.ranks.count  # an image of each rank counts as a step
+        self._recorded = RecordedStep(self.model.losses) if self._recordable() else None
         writer.GLOBAL_BUFFER["max_iter"] = self.last_step + 1  # nerfstudio forgets the steps before a resume
 
     @property

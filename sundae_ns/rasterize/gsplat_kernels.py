@@ -183,11 +183,11 @@ class _Colors(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         means, center, dc, rest, colors = ctx.saved_tensors
-        grads = [torch.empty_like(value) for value in (means, dc, rest)]
+        wanted = (means, dc, rest if ctx.needs_input_grad[4] else None)
+        grads = [None if value is None else torch.empty_like(value) for value in wanted]
         threads = -(-len(means) // _PER_BLOCK) * _PER_BLOCK
-        numbers = [len(means), ctx.degree, means, center, int(center.ndim > 1)]
-        arguments = [*numbers, rest, rest.shape[1], colors, gradient.contiguous(), *grads]
-        ctx.kernels["harmonic_colors_backward"](threads, arguments)
+        given = [len(means), ctx.degree, means, center, int(center.ndim > 1), rest, rest.shape[1], colors]
+        ctx.kernels["harmonic_colors_backward"](threads, [*given, gradient.contiguous(), *grads])
         return None, grads[0], None, grads[1], grads[2]
 
 

@@ -41,14 +41,14 @@ class RenderSettings:
 
     backend: Backend
     active_sh_degree: int = MAX_SH_DEGREE  # Highest SH degree in use, at most that of the Gaussians
+    fixed_harmonics: bool = False  # Whether the harmonics beyond the base colour get no gradient
     antialiased: bool = False
     """Whether opacities compensate for the smallest footprint (``rasterize_mode`` of splatfacto)."""
     training: bool = False
     """Whether gradients are needed. Images are then not clamped, and the head runs at their scale."""
     absgrad: bool = False  # Whether to sum absolute gradients of the projected centres
     head: CompensationHead | None = None  # The head; None while it is disabled
-    trained_focal: tuple[float, float] | None = None
-    """Shortest and longest focal length of the images that the head was trained on, pixels."""
+    trained_focal: tuple[float, float] | None = None  # Shortest and longest focal length of the head's images, pixels
 
 
 def colors_from(params: Mapping[str, Tensor], gaussians: Gaussians, center: Tensor, settings: RenderSettings) -> Tensor:
@@ -58,9 +58,9 @@ def colors_from(params: Mapping[str, Tensor], gaussians: Gaussians, center: Tens
     """
     if gaussians.encoding == "logits":
         return params["features_dc"].sigmoid()
-    degree = min(gaussians.sh_degree, settings.active_sh_degree)
-    coefficients = params["features_dc"], params["features_rest"]
-    return harmonic_colors(degree, params["means"], center, *coefficients, backend=settings.backend)
+    rest = params["features_rest"].detach() if settings.fixed_harmonics else params["features_rest"]
+    values = params["means"], center, params["features_dc"], rest
+    return harmonic_colors(min(gaussians.sh_degree, settings.active_sh_degree), *values, backend=settings.backend)
 
 
 class GaussianSource:

@@ -108,8 +108,8 @@ def _rows(state: TrainingState, trained: tuple[str, ...]) -> Iterator[tuple[str,
         yield from ((name, running, name) for name in STATISTICS if running.get(name) is not None)
 
 
-SPARE_PAIRS = 2.0  # Capacity for tile/Gaussian pairs, as a multiple of the most that a view has needed
-MAX_RECORDINGS = 8  # Recordings kept at a time: one for each image size and SH degree in use
+SPARE_PAIRS = 1.5  # Capacity for tile/Gaussian pairs, as a multiple of the most that a view has needed
+MAX_RECORDINGS = 16  # Recordings kept at a time: two for each image size and SH degree in use
 UNUSED = 1000
 """Steps after which an unused recording makes room. Where more sizes are in use than fit, the others run kernel by
 kernel, because recording takes longer than a step."""
@@ -363,6 +363,6 @@ def _kind(state: TrainingState, inputs: StepInputs, settings: RenderSettings) ->
     degree = min(state.gaussians.sh_degree, settings.active_sh_degree)
     return (
         (camera.width, camera.height, inputs.mask is not None, degree, settings.antialiased, settings.absgrad),
-        (state.densifying, state.pruned, state.head_enabled),
+        (state.densifying, state.pruned, state.head_enabled, settings.fixed_harmonics),
         None if head is None else (head.net, *vars(head.config).values()),
     )

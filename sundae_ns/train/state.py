@@ -50,6 +50,7 @@ class TrainingState:
     head_starts_at: float = math.inf  # Step of the schedule after which the head is enabled
     provisional: bool = False  # Whether a trial is trained whose field may be dropped
     restored: int = 0  # Number of times in this process that other weights took the place of the trained ones
+    harmonics_every: int = 1  # Steps to one that trains the harmonics beyond the base colours
     sh_degree_interval: int | None = None  # Steps after which the next SH degree is enabled; None enables all at once
 
     @property
@@ -112,6 +113,7 @@ class TrainingState:
             antialiased=antialiased,
             training=training,
             absgrad=absgrad and training and self.densifying,
+            fixed_harmonics=training and self.step % self.harmonics_every > 0,
             head=self.head if self.head_enabled else None,
             trained_focal=self.trained_focal,
         )

@@ -193,11 +193,7 @@ class Trials(Callback):
         return {"progress": asdict(self.progress), "engine": engine, "head": self.decides_head}
 
     def prepare_loading(self, state: TrainingState, saved: Mapping[str, Any]) -> None:
-        """Give head and features the width that they have in the checkpoint, or remove them.
-
-        Raises:
-            CheckpointError: the checkpoint carries no decision about the head.
-        """
+        """Give head and features the width of the checkpoint, or remove them; ``CheckpointError`` if it has none."""
         if not self.decides_head:
             return
         if not saved.get("head"):
@@ -214,11 +210,7 @@ class Trials(Callback):
             state.remove_head()
 
     def load_state_dict(self, state: TrainingState, saved: Mapping[str, Any]) -> None:
-        """Counterpart of :meth:`state_dict`; the head is enabled as the trial has it.
-
-        Raises:
-            CheckpointError: the checkpoint lacks Gaussians to which its trials may return.
-        """
+        """Counterpart of :meth:`state_dict`; ``CheckpointError`` if Gaussians to go back to are missing."""
         if not saved:
             return
         engine, tried = saved["engine"], [Tried(**row) for row in saved["progress"]["tried"]]

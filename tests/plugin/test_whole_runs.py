@@ -107,6 +107,7 @@ def check_training(rank, folder):
     every = [torch.empty_like(weights) for _ in range(RANKS)]
     dist.all_gather(every, weights)
     assert torch.equal(every[0], every[1])
+    assert model.state.harmonics_every == 2 * RANKS  # an image of each rank counts as a step
     assert model.num_points == model.source.sizes[rank]
     assert max(model.source.sizes) - min(model.source.sizes) <= 1
     group = trainer.optimizers.optimizers["opacities"].param_groups[0]

@@ -292,3 +292,7 @@ def test_colors_and_gradients_match_the_reference(degree, each):
         # The constant harmonic does not depend on the place.
         gradient = torch.zeros_like(other) if other.grad is None else other.grad
         torch.testing.assert_close(one.grad.double(), gradient, rtol=1e-4, atol=5e-5)
+    fixed = [value.detach().requires_grad_() for value in ours[:2]]
+    colors = harmonic_colors(degree, fixed[0], center, fixed[1], rest, backend=RecordableGsplat(Capacity()))
+    (colors * weights).sum().backward()
+    assert all(torch.equal(one.grad, other.grad) for one, other in zip(fixed, ours[:2], strict=True))
