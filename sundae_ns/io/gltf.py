@@ -34,7 +34,7 @@ from sundae_ns.core.files import replacing
 from sundae_ns.core.gaussians import SH_C0, sh_degree
 from sundae_ns.io.budget import afford, afford_gaussians, parsed_json
 from sundae_ns.io.coordinates import similarity
-from sundae_ns.io.ply import LEAST_OPACITY, MAX_SH_DEGREE, UNMARKED, Marks, check_gaussians, checked, vector
+from sundae_ns.io.ply import LEAST_OPACITY, UNMARKED, Marks, check_gaussians, checked, vector
 from sundae_ns.io.splat import joined
 from sundae_ns.io.spz import decoded
 
@@ -245,7 +245,7 @@ def _read_primitive(document: Json, binary: memoryview, primitive: Json) -> tupl
         return torch.from_numpy(_values(document, binary, attributes[name]))
 
     means = values("POSITION")
-    degree = max((d for d in range(MAX_SH_DEGREE + 1) if set(semantics(d)) <= attributes.keys()), default=0)
+    degree = int(max(sum(f"{EXTENSION}:SH_DEGREE_" in name for name in attributes) - 1, 0) ** 0.5)  # all, or missing
     afford_gaussians(len(means), (degree + 1) ** 2 - 1, len(binary) // 8)  # accessors may share their bytes
     rest = [values(name) for name in semantics(degree)]
     params = {

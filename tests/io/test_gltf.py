@@ -23,6 +23,7 @@ from sundae_ns.io.spz import read_spz
 THEIRS = Path(__file__).parent / "foreign" / "splat_transform.glb"
 """Five Gaussians of SH degree 2, by ``splat-transform`` 3.7.0 from a .ply with random means of seed 0."""
 PRIMITIVE = "meshes/0/primitives/0"
+SHARED = f"{PRIMITIVE}/attributes/{EXTENSION}"
 SPLAT, SPZ_2 = f"{PRIMITIVE}/extensions/{EXTENSION}", f"{EXTENSION}_compression_spz_2"
 
 
@@ -192,10 +193,12 @@ def copies(count, nodes):
 
 HOSTILE = {
     "no Gaussians": ({f"{PRIMITIVE}/extensions": {}}, f"no mesh of its scene has {EXTENSION}"),
-    "no widths": ({f"{PRIMITIVE}/attributes/{EXTENSION}:SCALE": GONE}, "SCALE"),
+    "no widths": ({f"{SHARED}:SCALE": GONE}, "SCALE"),
     "another kernel": ({f"{SPLAT}/kernel": "box"}, "of another kernel"),
     "compressed": ({f"{SPLAT}/extensions": {"KHR_gaussian_splatting_compression_spz": {}}}, "compression_spz"),
     "no SPZ": ({f"{SPLAT}/extensions": {SPZ_2: {"bufferView": 0}}}, "missing|header"),
+    "a part of the harmonics": ({f"{SHARED}:SH_DEGREE_1_COEF_2": GONE}, "have no .*DEGREE_1_COEF_2"),
+    "SH degree 5": ({f"{PRIMITIVE}/attributes": lambda given: given | dict.fromkeys(semantics(5), 0)}, "35 SH"),
     "a later version": ({"asset/minVersion": "2.1"}, "it requires glTF 2.1"),
     "a negative scene": ({"scene": -1}, "-1 is no index"),
     "nothing shown": ({"nodes": [{"children": [1], **HIDDEN}, {"mesh": 0}]}, "no mesh of its scene has"),
