@@ -280,9 +280,9 @@ def _decoded(file: Entry, meta: Mapping[str, Any], size: int) -> dict[str, Tenso
     rest = np.zeros((n, 0, 3), np.float32)
     if coefficients:
         centres = _pixels(file(meta["shN"]["files"][0]), MAX_PALETTE * coefficients)
-        label = pixels(meta["shN"], 1, 2).astype(np.int64)
-        codes = centres[..., :3].reshape(-1, coefficients, 3)[label[:, 0] + 256 * label[:, 1]]
-        rest = np.asarray(meta["shN"]["codebook"], np.float32)[codes]
+        label = pixels(meta["shN"], 1, 2).astype(np.int64) @ [1, 256]
+        rows = centres[..., :3].reshape(len(centres) * _ROW_ENTRIES, coefficients, 3)
+        rest = np.asarray(meta["shN"]["codebook"], np.float32)[rows[label]]
     arrays = {
         "scales": np.asarray(meta["scales"]["codebook"], np.float32)[pixels(meta["scales"], 0, 3)],
         "quats": from_smallest_three((turns[:, :3] / 255.0 - 0.5) * math.sqrt(2.0), largest),
