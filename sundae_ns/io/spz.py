@@ -87,16 +87,16 @@ def decoded(content: bytes, axes: str) -> tuple[dict[str, Tensor], Marks]:
     packed = content[:2] == b"\x1f\x8b"
     stream = io.BytesIO(content) if not packed else gzip.GzipFile(fileobj=io.BytesIO(content))
     magic, version, n, degree, bits, flags, _ = _HEADER.unpack(read_exactly(stream, _HEADER.size))
-    if magic != b"NGSP" or version not in ((1, 2, 3) if packed else (1, 2, 3, 4)) or bits > 24:
-        raise ValueError(f"its header is {magic!r} {version}, not that of a .spz of version 1 to 4; gunzip other files")
+    if magic != b"NGSP" or version not in ((1, 2, 3) if packed else (1, 2, 3, 4)) or bits > 24 or flags > 3:
+        raise ValueError(f"its header, {magic!r} {version} {flags}, is not that of version 1 to 4; gunzip other files")
     coefficients = (degree + 1) ** 2 - 1
     afford_gaussians(n, coefficients, len(content))
     widths = (6 if version == 1 else 9, 1, 3, 3, 3 if version < 3 else 4, 3 * coefficients)
     if version < 4:
         parts = [read_exactly(stream, n * width) for width in widths]
         extensions = stream.read(1 << 16)
-        if stream.read(1):  # at the end it has compared the checksum
-            raise ValueError("it unpacks to far more than its header states")
+        if stream.read(1) or (extensions and not flags & 2):  # at the end it has compared the checksum
+            raise ValueError("it unpacks to more than its header states")
     else:
         parts, extensions = _streams(content, [n * width for width in widths if width])
     positions, alphas, colors, scales, rotations, harmonics = (

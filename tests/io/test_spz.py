@@ -65,8 +65,8 @@ def _with_stream(content, frame):
 
 FIELD = small_field(100, 1)
 HOSTILE = {
-    "a second member": (lambda: spz(FIELD, 3) + gzip.compress(bytes(1 << 27), 1), "unpacks to far more"),
-    "a long end": (lambda: gzip.compress(gzip.decompress(spz(FIELD, 3)) + bytes(1 << 27), 1), "unpacks to far more"),
+    "a second member": (lambda: spz(FIELD, 3) + gzip.compress(bytes(1 << 27), 1), "unpacks to more"),
+    "a long end": (lambda: gzip.compress(gzip.decompress(spz(FIELD, 3)) + bytes(1 << 27), 1), "unpacks to more"),
     "a frame of 256 MB": (lambda: _with_stream(spz(FIELD, 4), _bomb(1 << 28)), "has not the 900 bytes"),
     "a short frame": (lambda: _with_stream(spz(FIELD, 4), _bomb(7)), "has not the 900 bytes"),
     "four billion Gaussians": (lambda: spz(FIELD, 4, count=2**32 - 1), "would unpack to"),
@@ -75,9 +75,11 @@ HOSTILE = {
     "SH degree 5": (lambda: spz(FIELD, 3, degree=5), "35 SH coefficients"),
     "a cut stream": (lambda: spz(FIELD, 3)[:-9], "ended before"),
     "a wrong checksum": (lambda: spz(FIELD, 3)[:-8] + bytes(8), "CRC"),
+    "a lower SH degree": (lambda: spz(FIELD, 3, degree=0), "unpacks to more"),
+    "levels of detail": (lambda: spz(FIELD, 4)[:14] + b"\x80" + spz(FIELD, 4)[15:], "b'NGSP' 4 128, is not that"),
     "version 5": (lambda: spz(FIELD, 5), "version 1 to 4"),
     "version 4 in gzip": (lambda: gzip.compress(spz(FIELD, 4)), "version 1 to 4"),
-    "another gzip file": (lambda: gzip.compress(b"ply" * 9), "not that of a .spz .*gunzip other files"),
+    "another gzip file": (lambda: gzip.compress(b"ply" * 9), "version 1 to 4; gunzip other files"),
     "99 fractional bits": (lambda: spz(FIELD, 3, bits=99), "version 1 to 4"),
     "unknown axes": (lambda: spz(FIELD, 4, axes=17), "out of range"),
 }
