@@ -44,7 +44,7 @@ _PIXELS = TILE * TILE
 _CHECK_EVERY = 8  # list entries between two checks for opaque tiles
 _FAINTEST = 20.0  # upper bound of negated exponents, far beyond log(255)
 _MIN_PER_THREAD = 8  # tiles
-_CHANNEL_GROUP = 8  # channels whose gradients are summed together
+_GROUP = 4  # channels whose gradients are summed together: their sums stay in registers, also in those of AVX2
 _MOMENTS = 8  # sums per Gaussian and tile after the channels: six moments, two absolute gradients
 _MIN_PER_THREAD_TO_SUM = 5_000  # Gaussians
 
@@ -64,7 +64,7 @@ class _Composite(torch.autograd.Function):
         (width, height), values = size, as_array(colors)
         tiles = -(-width // TILE) * -(-height // TILE)
         image, alpha = (np.zeros((height, width, channels), values.dtype) for channels in (values.shape[1], 1))
-        ends = np.empty((tiles, _PIXELS), values.dtype), np.empty((tiles, _PIXELS), np.int32)
+        ends = np.empty((2, tiles, _PIXELS), values.dtype)
         regions = 0
         for region in lists():
             regions += 1
@@ -81,15 +81,15 @@ class _Composite(torch.autograd.Function):
         means2d, _, _, colors = ctx.saved_tensors
         needs_geometry, needs_colors = any(ctx.needs_input_grad[:3]), ctx.needs_input_grad[3]
         absgrad, values = ctx.absgrad and needs_geometry, as_array(colors)
-        padded = -(-colors.shape[1] // _CHANNEL_GROUP) * _CHANNEL_GROUP
-        gradients, needs = (as_array(grad_image), as_array(grad_alpha)), (needs_geometry, needs_colors, absgrad)
+        padded = -(-colors.shape[1] // _GROUP) * _GROUP
+        gradients, needs = (as_array(grad_image), as_array(grad_alpha)), (needs_geometry, needs_colors, absgrad, padded)
         outputs = tuple(np.zeros(value.shape, values.dtype) for value in ctx.saved_tensors)
         absolute_grads = np.zeros(means2d.shape if absgrad else (0, 0, 0), values.dtype)
         for region in ctx.lists():
-            parts = np.empty((len(region.slots), padded + _MOMENTS), values.dtype)
+            parts = np.empty((len(region.slots), padded + _MOMENTS * needs_geometry), values.dtype)
             arguments = (tuple(region), (values, *ctx.ends), gradients, needs, parts)
             parallel_for(_blend_backward, len(region.longest_first), *arguments, min_per_thread=_MIN_PER_THREAD)
-            summed = (tuple(region), parts, outputs, absolute_grads)
+            summed = (tuple(region), parts, padded, outputs, absolute_grads)
             parallel_for(_sum_slots, len(region.ids), *summed, min_per_thread=_MIN_PER_THREAD_TO_SUM)
         if ctx.absgrad:
             means2d.absgrad = torch.from_numpy(absolute_grads) if absgrad else torch.zeros_like(means2d)
@@ -192,10 +192,9 @@ def _blend_backward(begin: int, end: int, lists: Any, blended: Any, gradients: A
     columns, tiles, starts, ranks, slots, spans, ids, _, table = lists
     colors, transmittances, last = blended
     grad_image, grad_alpha = gradients
-    needs_geometry, needs_colors, absgrad = needs
+    needs_geometry, needs_colors, absgrad, padded = needs
     number = table.dtype.type
     height, width, channels = grad_image.shape
-    padded = parts.shape[1] - _MOMENTS
     across, down = _pixel_centres(table)
     x, none = load(across, 0), zeros(table)
     through, behind = np.empty(_PIXELS, table.dtype), np.empty(_PIXELS, table.dtype)
@@ -214,7 +213,7 @@ def _blend_backward(begin: int, end: int, lists: Any, blended: Any, gradients: A
                 for c in range(channels):
                     grads[p // WIDTH, c, p % WIDTH] = grad_image[top + y, left + x_of_pixel, c]
                 alpha_grads[p] = grad_alpha[top + y, left + x_of_pixel, 0]
-        start, deepest = starts[tile], blended_last.max()
+        start, deepest = starts[tile], int(blended_last.max())
         for entry in range(start + deepest, starts[tile + 1]):
             parts[slots[entry]] = 0
         for place in range(deepest, 0, -1):
@@ -254,9 +253,11 @@ def _blend_backward(begin: int, end: int, lists: Any, blended: Any, gradients: A
                         absolute_y = absolute_y + absolute(grad_exponent * slope_y)
             part = slots[entry] * parts.shape[1]
             if needs_colors:
-                for c in range(0, padded, _CHANNEL_GROUP):
+                for c in range(0, padded, _GROUP):
                     _sum_channels(weights, grads, spans[entry, 0], spans[entry, 1], c, parts, part + c)
-            store_sums(parts, part + padded, m, mx, my, mxx, mxy, myy, absolute_x, absolute_y)
+            if needs_geometry:
+                store_sums(parts, part + padded, m, mx, my, mxx)
+                store_sums(parts, part + padded + 4, mxy, myy, absolute_x, absolute_y)
 
 
 @inlined
@@ -272,24 +273,22 @@ def _product(grads: Any, at: int, colors: Any, color: int, channels: int) -> Any
 
 @inlined
 def _sum_channels(weights: Any, grads: Any, first: int, beyond: int, channel: int, parts: Any, part: int) -> None:
-    """Write the sums, over the touched pixels of a tile, of weights times the gradients of eight channels."""
-    a = b = c = d = e = f = g = h = zeros(weights)
+    """Write the sums, over the touched pixels of a tile, of weights times the gradients of four channels."""
+    a = b = c = d = zeros(weights)
     for step in range(first, beyond):
         weight = load(weights, step * WIDTH)
         at = (step * grads.shape[1] + channel) * WIDTH
         a, b = fma(weight, load(grads, at), a), fma(weight, load(grads, at + WIDTH), b)
         c, d = fma(weight, load(grads, at + 2 * WIDTH), c), fma(weight, load(grads, at + 3 * WIDTH), d)
-        e, f = fma(weight, load(grads, at + 4 * WIDTH), e), fma(weight, load(grads, at + 5 * WIDTH), f)
-        g, h = fma(weight, load(grads, at + 6 * WIDTH), g), fma(weight, load(grads, at + 7 * WIDTH), h)
-    store_sums(parts, part, a, b, c, d, e, f, g, h)
+    store_sums(parts, part, a, b, c, d)
 
 
 @compiled
-def _sum_slots(begin: int, end: int, lists: Any, parts: Any, outputs: Any, absolute_grads: Any) -> None:
+def _sum_slots(begin: int, end: int, lists: Any, parts: Any, padded: int, outputs: Any, absolute_grads: Any) -> None:
     """Sum the slots of each Gaussian in float64, convert moments to gradients, and add them to the outputs."""
     _, _, _, _, _, _, ids, first_slots, table = lists
     grad_means2d, grad_conics, grad_opacities, grad_colors = outputs
-    channels, width = parts.shape[1] - _MOMENTS, parts.shape[1]
+    width = parts.shape[1]
     sums = np.empty(width)
     for rank in range(begin, end):
         i = ids[rank]
@@ -299,14 +298,16 @@ def _sum_slots(begin: int, end: int, lists: Any, parts: Any, outputs: Any, absol
                 sums[d] += parts[slot, d]
         for c in range(grad_colors.shape[1]):
             grad_colors[i, c] += sums[c]
+        if width == padded:  # only the colours have gradients
+            continue
         xx, xy, yy = 2 * float(table[rank, HALF_XX]), table[rank, XY], 2 * float(table[rank, HALF_YY])
-        mx, my = sums[channels + 1], sums[channels + 2]
+        mx, my = sums[padded + 1], sums[padded + 2]
         grad_means2d[0, i, 0] += xx * mx + xy * my
         grad_means2d[0, i, 1] += xy * mx + yy * my
-        grad_conics[i, 0] -= 0.5 * sums[channels + 3]
-        grad_conics[i, 1] -= sums[channels + 4]
-        grad_conics[i, 2] -= 0.5 * sums[channels + 5]
-        grad_opacities[i] += sums[channels] / table[rank, OPACITY]
+        grad_conics[i, 0] -= 0.5 * sums[padded + 3]
+        grad_conics[i, 1] -= sums[padded + 4]
+        grad_conics[i, 2] -= 0.5 * sums[padded + 5]
+        grad_opacities[i] += sums[padded] / table[rank, OPACITY]
         if len(absolute_grads) > 0:
-            absolute_grads[0, i, 0] += sums[channels + 6]
-            absolute_grads[0, i, 1] += sums[channels + 7]
+            absolute_grads[0, i, 0] += sums[padded + 6]
+            absolute_grads[0, i, 1] += sums[padded + 7]
