@@ -71,9 +71,8 @@ def describe(
     gaussians, cameras = scene.gaussians, cameras or scene.cameras
     views = for_cleaning(cameras) or virtual_cameras(scene, LOOKING)
     weights, means = weights_in(scene, views, console=console), gaussians["means"].double()
-    stated = None
-    if path.is_file():  # a .sog holds its meta.json anywhere
-        stated = _PRODUCER.search(path.read_bytes()[: None if kind_of(path) == "sog" else 1 << 16])
+    end = 1 << 16 if path.is_file() and kind_of(path) != "sog" else None  # a .sog holds its meta.json anywhere
+    stated = _PRODUCER.search(path.read_bytes()[:end] if path.is_file() else b"")
     return {
         "bytes": bytes_at(path) or bytes_of(scene.gaussians) + bytes_of_module(scene.head),
         "gaussians": scene.num_gaussians,

@@ -108,8 +108,7 @@ def save(scene: Scene, path: Path | str, *, upright: bool = False, config: PackC
     >>> sn.load(path).num_gaussians
     50
     """
-    path = Path(path)
-    suffix = path.suffix.lower()
+    path, suffix = Path(path), Path(path).suffix.lower()
     if suffix not in SUFFIXES:
         raise ConfigError(f"{path} has no supported suffix; name it {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
     if upright and suffix not in FORMATS:

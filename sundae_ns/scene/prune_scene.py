@@ -348,11 +348,14 @@ def prune_to_bytes(
             known: dict[str, Any] = {"weights": weights, "graph": graph, "images": images}
             return prune_with_mask(scene, None, count, cameras, rule, progress=progress, fit=fit, **known)
 
-        best = possible[0]
+        best, psnr = possible[0], -math.inf
         if len(possible) > 1:
             judges = [at_most(camera, PIXELS) for camera in (split(cameras)[1] or list(cameras))[:JUDGES]]
             truths, as_read = [render(scene, camera).rgb for camera in judges], _as_packed if packs else Form.of
-            best = max(possible, key=lambda i: measure(as_read(forms[i], cut(counts[i]).scene), truths, judges).psnr)
+            for i in possible:  # less and less exact, until more Gaussians do not make up for it
+                if (found := measure(as_read(forms[i], cut(counts[i]).scene), truths, judges).psnr) <= psnr:
+                    break
+                best, psnr = i, found
         form, pruned = forms[best], cut(counts[best], fit=packs)
         if packs:
             return pruned, rounded(pruned, form)

@@ -252,9 +252,8 @@ def from_points(points: Tensor, rgb: Tensor, *, sh_degree: int) -> dict[str, Ten
 
 def random_quaternions(n: int) -> Tensor:
     """Uniformly distributed unit quaternions ``[n, 4]`` (Shoemake, 1992)."""
-    u, v, w = torch.rand(3, n)
+    u, v, w = torch.rand(3, n) * torch.tensor([[1.0], [2 * torch.pi], [2 * torch.pi]])
     a, b = (1 - u).sqrt(), u.sqrt()
-    v, w = 2 * torch.pi * v, 2 * torch.pi * w
     return torch.stack([a * v.sin(), a * v.cos(), b * w.sin(), b * w.cos()], dim=-1)
 
 
