@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from foreign_files import columns_of, small_field, write_columns
-from limits import refused
+from limits import refused, verdict
 from plyfile import PlyData, PlyElement
 
 from sundae_ns.core.gaussians import SPLAT_NAMES, sanitise
@@ -178,6 +178,11 @@ def test_marks_of_a_header(tmp_path, comments, marks):
     content = (tmp_path / "a.ply").read_bytes().replace(b"\ncomment ", b"\nobj_info ")
     (tmp_path / "a.ply").write_bytes(content)
     assert ply_marks(tmp_path / "a.ply") == marks
+
+
+def test_a_long_comment_takes_no_time(tmp_path):
+    write_ply(tmp_path / "a.ply", small_field(3), comments=["antialias" + 50_000 * "!" + "b c"])
+    assert verdict(lambda: ply_marks(tmp_path / "a.ply"), 50_000) is None
 
 
 def _without(*names):
