@@ -70,10 +70,6 @@ def write_lod(path):
     Path(shutil.make_archive(str(path), "zip", path.parent / "lod")).rename(path)
 
 
-def write_html(path):
-    sn.save(sn.Scene(Gaussians(small_field(20))), path)
-
-
 def write_path(path):
     row = {"camera_to_world": [float(i % 5 == 0) for i in range(16)], "fov": 50}
     path.write_text(json.dumps({"camera_path": [row] * 3, "render_width": 64, "render_height": 48, "fps": 24}))
@@ -82,10 +78,6 @@ def write_path(path):
 def write_photo(path):
     assert reads_heif()
     photo(path, image=Image.fromarray(np.arange(3072, dtype=np.uint8).reshape(32, 32, 3)), orientation=6, focal=5.0)
-
-
-def read_photo(path):
-    upright(photo_of(path))
 
 
 def write_clip(path):
@@ -110,9 +102,12 @@ READERS = {
     "text.ply": (lambda path: write_cloud(path, text=True), read_cloud),
     "a.ckpt": (lambda path: write_checkpoint(path, small_field(20)), read_gaussians),
     "a.sundae": (lambda path: write_scene(path, SCENE), unpack),
-    "page.html": (write_html, sn.load),
+    "page.html": (lambda path: sn.save(sn.Scene(Gaussians(small_field(20))), path), sn.load),
     "path.json": (write_path, sn.cameras_of),
-    **{f"0.{kind}": (write_photo, read_photo) for kind in ("jpg", "png", "tif", "webp", "bmp", "heic")},
+    **{
+        f"0.{kind}": (write_photo, lambda path: upright(photo_of(path)))
+        for kind in ("jpg", "png", "tif", "webp", "bmp", "heic")
+    },
     **{f"a.{kind}": (write_clip, read_video) for kind in ("mp4", "mkv", "avi")},
 }
 """Files by their names: a writer, and the reader that must survive them."""

@@ -20,10 +20,10 @@ _VALUES = [b"\xff" * 8, b"\xff" * 7 + b"\x7f", b"\0" * 8, b"99999999", b"-1", b"
 def damage(draw: st.DrawFn) -> Change:
     """One change of the bytes of a file; half of them are near its start, which holds counts and types."""
     kind = draw(st.sampled_from(["cut", "flip", "replace", "delete", "repeat"]))
-    where = draw(st.floats(0, 1, exclude_max=True))
-    at_start, length = draw(st.booleans()), draw(st.sampled_from([1, 7, 64, 1000]))
-    values = draw(st.sampled_from(_VALUES) | st.binary(min_size=1))
-    bits = draw(st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 7)), min_size=1, max_size=30))
+    at_start, where = draw(st.booleans()), draw(st.integers(0, (1 << 20) - 1)) / (1 << 20)
+    length = draw(st.sampled_from([1, 7, 64, 1000])) if kind in ("delete", "repeat") else 0
+    values = draw(st.sampled_from(_VALUES) | st.binary(min_size=1)) if kind == "replace" else b""
+    bits = draw(st.binary(min_size=3, max_size=90)) if kind == "flip" else b""
 
     def change(content: bytes) -> bytes:
         data, size = bytearray(content), min(len(content), 80) if at_start else len(content)
@@ -31,8 +31,8 @@ def damage(draw: st.DrawFn) -> Change:
         if kind == "cut":
             return content[:i]
         if kind == "flip" and size:
-            for share, bit in bits:
-                data[int(share * size)] ^= 1 << bit
+            for high, low, bit in zip(bits[::3], bits[1::3], bits[2::3]):
+                data[(high << 8 | low) * size >> 16] ^= 1 << bit % 8
         elif kind == "replace":
             data[i : i + len(values)] = values
         elif kind == "delete":
