@@ -173,7 +173,7 @@ def keep_vertices(source: Path, out: Path, mask: Tensor, params: Mapping[str, Te
             rows[name] = shift + column.astype(np.float64)
         if "filter_3d" in (rows.dtype.names or ()):  # the parameters are fused with it
             rows["filter_3d"] = 0
-    header = re.sub(rb"(?<=[\r\n])(element\s+vertex\s+)\d+", rb"\g<1>%d" % len(rows), file.header, count=1)
+    header = re.sub(rb"(?i)(?<=[\r\n])(element\s+vertex\s+)\d+", rb"\g<1>%d" % len(rows), file.header, count=1)
     with replacing(out) as partial, partial.open("wb") as target, source.open("rb") as original:
         original.seek(len(file.header))
         target.write(header + original.read(start - len(file.header)))

@@ -9,7 +9,16 @@ from plyfile import PlyData, PlyElement
 
 from sundae_ns.core.gaussians import SPLAT_NAMES, sanitise
 from sundae_ns.io.formats import read_gaussian_file
-from sundae_ns.io.ply import Marks, comments_of, keep_vertices, ply_marks, read_ply, read_point_cloud, write_ply
+from sundae_ns.io.ply import (
+    Marks,
+    comments_of,
+    has_own_columns,
+    keep_vertices,
+    ply_marks,
+    read_ply,
+    read_point_cloud,
+    write_ply,
+)
 
 XYZ = np.array([[0.5, -1.25, 2.0], [3.0, 4.0, -5.5]], np.float32)
 RGB = np.array([[0, 128, 255], [10, 20, 30]], np.uint8)
@@ -88,7 +97,7 @@ SAME = {
         b"nx\nproperty float ny\nproperty float nz", b"red\nproperty float green\nproperty float blue"
     ),
     "other letters": _header(b"element", COMMENT),
-    "capital letters": _header(b"x\nproperty float y\nproperty float z", b"X\nproperty FLOAT Y\nproperty Float Z"),
+    "capital letters": _header(b"element vertex 9\nproperty float x", b"ELEMENT Vertex 9\nproperty FLOAT X"),
     "spaces at the ends of lines": _header(b"element", b"element", b" \n"),
     "lines of DOS": _header(b"element", COMMENT, b"\r\n"),
     "lines of old Macs": _header(b"element", COMMENT, b"\r"),
@@ -103,6 +112,9 @@ def test_other_forms_are_the_same_gaussians(tmp_path, form):
     values = read_gaussian_file(path)[0].gaussians
     assert all(torch.equal(values[name], params[name]) for name in SPLAT_NAMES)
     assert torch.equal(read_point_cloud(path)[0], params["means"])
+    if has_own_columns(path):
+        keep_vertices(path, tmp_path / "b.ply", torch.arange(9) > 4)
+        assert torch.equal(read_point_cloud(tmp_path / "b.ply")[0], params["means"][5:])
 
 
 @pytest.mark.parametrize("name", ["filter_3D", "filter_3d"])
