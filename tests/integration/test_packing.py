@@ -136,7 +136,7 @@ def test_a_target_of_quality_is_met_and_states_it(tiny, tmp_path, capsys):
     found = figures(capsys, tiny.folder, "-o", tmp_path / "a.sundae", "--target-drop", 0.005)
     (before, after), (before_ssim, after_ssim) = found["psnr"], found["ssim"]
     assert before - 0.005 <= after < before + 0.05
-    assert after_ssim == pytest.approx(before_ssim, abs=0.002)
+    assert after_ssim == pytest.approx(before_ssim, abs=0.01)
     assert found["views"] == 3
 
 
