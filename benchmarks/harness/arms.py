@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import difflib
-import io
-import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import tyro
 import yaml
 
@@ -22,7 +20,12 @@ from sundae_ns.core.errors import ConfigError
 DEFAULT_FILE = Path(__file__).with_name("arms.yaml")
 """The default arms; also an example of a file of arms."""
 
-_NAME = re.compile(r"[A-Za-z0-9][\w.-]*")
+_VALUE = {"anyOf": [{"type": "string"}, {"type": "array", "minItems": 1, "items": {"type": "string"}}]}
+_NAME = {"type": "string", "pattern": rf"^[A-Za-z0-9](?!.*{WARM_UP}$)[\w.-]*$"}
+_ENTRY = {"name": _NAME, "method": {"type": "string", "minLength": 1}}
+_ENTRY["options"] = {"type": "object", "additionalProperties": _VALUE}
+_ITEM = {"type": "object", "required": ["name"], "additionalProperties": False, "properties": _ENTRY}
+_SCHEMA = {"type": "array", "minItems": 1, "items": _ITEM}
 _KEEP_RATIO, _STEPS = "pipeline.model.pruning.keep-ratio", "max-num-iterations"
 _SET_BY_BENCH = ("data", "machine.seed", "output-dir", "experiment-name", "timestamp", "pipeline.model.warm-start")
 _FLAGS = {"true": "True", "false": "False", "null": "None"}
@@ -61,45 +64,24 @@ def read_entries(path: Path) -> list[Entry]:
     try:
         # Scalars stay text: YAML would read `off` as False.
         loaded = yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.BaseLoader)
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} cannot be read ({error}); give a file of arms") from error
-    except (yaml.YAMLError, RecursionError) as error:
-        raise ConfigError(f"{path} is no YAML ({' '.join(str(error).split())}); mend it") from error
-    if not isinstance(loaded, list) or not loaded:
-        raise ConfigError(f"{path} holds no list of arms; write `- name: NAME` for each, its method and options below")
-    entries = [_entry(item, f"{path}, arm {number}") for number, item in enumerate(loaded, start=1)]
+        jsonschema.validate(loaded, _SCHEMA)
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
+        raise ConfigError(f"{path} cannot be read ({' '.join(str(error).split())}); give a file of arms") from error
+    except jsonschema.ValidationError as error:
+        raise ConfigError(f"{path}, {error.json_path}: {error.message}; {DEFAULT_FILE.name} is an example") from error
+    entries = [Entry(item["name"], item.get("method"), _options(item.get("options", {}))) for item in loaded]
     _refuse_duplicates((entry.name for entry in entries), str(path))
     return entries
 
 
-def _entry(item: Any, where: str) -> Entry:
-    """One item of a file's list."""
-    if not isinstance(item, dict) or not isinstance(item.get("name"), str):
-        raise ConfigError(f"{where} has no name; write `- name: NAME`")
-    name, method = item["name"], item.get("method")
-    unknown = sorted(set(map(str, item)) - {"name", "method", "options"})
-    if unknown:
-        raise ConfigError(f"{where} ({name}) has {unknown[0]!r}; an arm has name, method and options")
-    if not _NAME.fullmatch(name) or name.endswith(WARM_UP):
-        raise ConfigError(f"{where} cannot be named {name!r}; use letters, digits, '.', '_' and '-', not ...{WARM_UP}")
-    if not isinstance(method, str | None) or method == "":
-        raise ConfigError(f"{where} ({name}) has a method that is no name; write `method: sundae`, or leave it out")
-    return Entry(name, method, _read_options(item.get("options", {}), f"{where} ({name})"))
-
-
-def _read_options(given: Any, where: str) -> dict[str, Words]:
+def _options(given: Mapping[str, str | list[str]]) -> dict[str, Words]:
     """Options by name, without the dashes."""
-    if not isinstance(given, dict):
-        raise ConfigError(f"{where} has options that are no mapping; write `name: value`")
-    options: dict[str, Words] = {}
+    options = {}
     for written, value in given.items():
-        name = written.lstrip("-").replace("_", "-")
-        words = tuple(value) if isinstance(value, list) else (value,)
-        if not words or not all(isinstance(word, str) for word in words):
-            raise ConfigError(f"{where} has option {name} without a plain value; write `{name}: value`")
-        if name in _SET_BY_BENCH:
-            raise ConfigError(f"{where} sets {name}, which the command sets itself; remove it")
-        options[name] = tuple(_FLAGS.get(word, word) for word in words)
+        words = value if isinstance(value, list) else [value]
+        options[written.lstrip("-").replace("_", "-")] = tuple(_FLAGS.get(word, word) for word in words)
+    if chosen := sorted(options.keys() & set(_SET_BY_BENCH)):
+        raise ConfigError(f"an arm sets {chosen[0]}, which the command sets itself; remove it")
     return options
 
 
@@ -157,18 +139,14 @@ def _config_of(entry: Entry, method: str, methods: Mapping[str, Any]) -> Any:
         near = difflib.get_close_matches(method, methods) or ["sundae", "splatfacto"]
         raise ConfigError(f"arm {entry.name}: ns-train has no method {method!r}; use {' or '.join(near)}")
     words = [word for name, value in entry.options.items() for word in (f"--{name}", *value)]
-    said = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
-            config = _parse(method, tuple(words))
+        config = _parse(method, tuple(words))
         for part in ("pruning", "head"):
             validate = getattr(getattr(config.pipeline.model, part, None), "validate", None)
             if validate is not None:
                 validate()
-    except SystemExit as error:
-        meant = re.search(r"Perhaps you meant:\s+--(\S+)", said.getvalue())
-        sanitise = f"did you mean {meant[1]}?" if meant else f"`ns-train {method} --help` lists its options"
-        raise ConfigError(f"arm {entry.name}: {_message_of(said.getvalue())}; {sanitise}") from error
+    except SystemExit as error:  # tyro has said why
+        raise ConfigError(f"arm {entry.name}: ns-train {method} refuses its options; mend them") from error
     except (ConfigError, ValueError) as error:
         raise ConfigError(f"arm {entry.name}: {error}") from error
     return config
@@ -181,15 +159,3 @@ def _parse(method: str, words: Words) -> Any:
 
     default = all_methods[method]
     return tyro.cli(tyro.conf.FlagConversionOff[type(default)], default=default, args=words)  # type: ignore[misc]
-
-
-def _message_of(box: str) -> str:
-    """The message in tyro's box of an error, in one line: between the title and the rule below it."""
-    lines = [line.strip("╭╮╰╯│ ") for line in box.splitlines()]
-    is_rule = [set(line) <= {"─", "-"} for line in lines]
-    words: list[str] = []
-    for line, rule in zip(lines[1:], is_rule[1:], strict=True):
-        if rule and words:
-            break
-        words += [] if rule else line.split()
-    return " ".join(words).rstrip(".") or "ns-train refuses its options"

@@ -80,44 +80,27 @@ def test_default_arms_and_those_of_a_file_together(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("name: a", "mine.yaml holds no list of arms; write"),
-        ("", "holds no list of arms"),
-        ("- name: [a", "mine.yaml is no YAML .*; mend it"),
-        ("- sundae", "arm 1 has no name; write `- name: NAME`"),
-        ("- name: a\n- method: sundae", "arm 2 has no name"),
-        ("- {name: a, colour: red}", r"arm 1 \(a\) has 'colour'; an arm has name, method and options"),
-        ("- name: a b", "cannot be named 'a b'; use letters"),
-        ("- name: sundae-warm-up", "cannot be named 'sundae-warm-up'"),
-        ("- {name: a, method: [sundae]}", "has a method that is no name; write"),
+        ("name: a", r"mine.yaml, \$: .* is not of type 'array'; arms.yaml is an example"),
+        ("- name: [a", "mine.yaml cannot be read .*; give a file of arms"),
+        ("- name: a\n- method: sundae", r"\$\[1\]: 'name' is a required property"),
+        ("- {name: a, colour: red}", r"\('colour' was unexpected\)"),
+        ("- name: a b", "'a b' does not match"),
+        ("- name: sundae-warm-up", "'sundae-warm-up' does not match"),
+        ("- {name: a, method: [sundae]}", r"\$\[0\].method"),
         ("- name: a\n- name: a", "mine.yaml has a twice; give each once"),
-        ("- {name: a, options: 3}", "has options that are no mapping; write"),
-        ("- {name: a, options: [b 1]}", "no mapping"),
-        ("- {name: a, options: {b: {c: d}}}", "has option b without a plain value; write `b: value`"),
-        ("- {name: a, options: {b: []}}", "has option b without a plain value"),
+        ("- {name: a, options: [b 1]}", r"\$\[0\].options"),
+        ("- {name: a, options: {b: []}}", r"\$\[0\].options.b"),
         ("- {name: a, options: {machine.seed: 1}}", "sets machine.seed, which the command sets itself; remove it"),
         ("- {name: a, method: splatfact}", "arm a: ns-train has no method 'splatfact'; use splatfacto"),
         ("- {name: a, method: nerfacto}", "arm a: nerfacto has no Gaussians; use splatfacto or a method of"),
-        (
-            "- {name: a, options: {P.prunning.score: response}}",
-            "Unrecog.*: .*score, response; did you mean P.pruning.score",
-        ),
-        ("- {name: a, options: {P.head: off}}", "options: --P.head, off; did you"),
-        (
-            "- {name: a, method: splatfacto, options: {P.pruning.score: a}}",
-            "score, a; `ns-train splatfacto --help` lists",
-        ),
-        ("- {name: a, options: {P.pruning.score: best}}", "arm a: invalid choice 'best' for argument"),
-        (
-            "- {name: a, options: {P.pruning.keep-ratio: many}}",
-            "keep-ratio: no type matching .* from .'many'.",
-        ),
+        ("- {name: a, options: {P.prunning.score: response}}", "arm a: ns-train sundae refuses its options"),
         ("- {name: a, options: {P.pruning.keep-ratio: 3}}", r"arm a: keep_ratio is 3.0: use a share"),
         ("- {name: a, options: {P.head.num-features: 0}}", "arm a: head.num-features is 0; set at least 1"),
     ],
 )
 def test_arms_are_refused_in_one_line_before_anything_is_trained(tmp_path, text, said):
     """``P`` is ``pipeline.model``."""
-    with pytest.raises(ConfigError, match=said.replace("P.", "pipeline.model.")) as raised:
+    with pytest.raises(ConfigError, match=said) as raised:
         chosen(written(tmp_path, text.replace("P.", "pipeline.model.")))
     assert "\n" not in str(raised.value)
 
