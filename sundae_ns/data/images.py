@@ -45,12 +45,12 @@ def check_image(path: Path, *, mask: bool = False) -> tuple[int, int]:
     if not path.exists():
         raise DataError(f"{path} does not exist{beside(path)}; correct the path or remove the view")
     with reading(path, "a complete image", remedy=REPAIR, missing=REPAIR), opened(path) as image:
-        size, mode, length = image.size, image.mode, path.stat().st_size
+        size, mode = image.size, "EPS" if image.format == "EPS" else image.mode  # Pillow would run Ghostscript on it
     if mode not in (("1", "L") if mask else _MODES):
         wanted = "one channel of 8 bits" if mask else "RGB, RGBA or grey with 8 bits per channel"
         raise DataError(f"{path} has pixels of type {mode}; save it with {wanted}")
     # No format stores 4,096 pixels in a byte, even of one flat colour.
-    if size[0] * size[1] > max(4096 * length, 1 << 20):
+    if size[0] * size[1] > max(4096 * (length := path.stat().st_size), 1 << 20):
         raise DataError(f"{path} claims {size[0]} x {size[1]} px in {length:,} bytes; it is incomplete, save it again")
     return size
 

@@ -5,9 +5,9 @@
     x y z  nx ny nz  f_dc_0..2  f_rest_0..3K-1  opacity  scale_0..2  rot_0..3 (wxyz)
 
 Normals are zero. ``f_rest`` is channel-major: K coefficients of red, then green, then blue. Feature vectors and heads
-do not fit. Readers also take text, other types and orders, further properties, ``red green blue`` in place of SH
-coefficients (``ns-export``), no ``scale_2`` (2DGS: a thickness of 0), and ``filter_3D``, the width of Mip-Splatting's
-filter, which they fuse; names in letters of any case. Of comments the last one of a kind counts:
+do not fit. Readers also take text (all its digits), other types and orders, further properties, ``red green blue`` for
+SH coefficients (``ns-export``), no ``scale_2`` (2DGS: a thickness of 0), and ``filter_3D``, the width of
+Mip-Splatting's filter, which they fuse; names in letters of any case. Of comments the last one of a kind counts:
 
     SplatRenderMode: mip             trained with antialiasing (Brush, splat-transform); of Postshot: antialiased 1
     Vertical axis: 0 -1 0            the upward direction (Brush), or a letter
@@ -210,7 +210,7 @@ class _Ply:
                     case ["property", "list", _, _, name]:
                         columns.append((name, _LIST))
                     case ["property", kind, name]:
-                        columns.append((name, order + _TYPES[kind]))
+                        columns.append((name, "f8" if self.text and _TYPES[kind] == "f4" else order + _TYPES[kind]))
             least, start = 0, len(self.header.splitlines()) if self.text else len(self.header)
             for name, (rows, columns) in stated.items():
                 if rows < 0 or (rows > 0 and not columns):

@@ -253,6 +253,7 @@ def bomb(width, height):
 
 IMAGES = {
     "floats": (lambda path: Image.new("F", SIZE).save(path, format="TIFF"), "pixels of type F"),
+    "PostScript": (lambda path: Image.new("RGB", SIZE).save(path, format="EPS"), "pixels of type EPS; save it"),
     "one pixel": (lambda path: Image.new("RGB", (1, 1)).save(path), "1 x 1 px but its camera says"),
     "empty": (lambda path: path.write_bytes(b""), "cannot identify image file"),
     "a folder": (lambda path: (path.unlink(), path.mkdir()), "cannot be read"),
