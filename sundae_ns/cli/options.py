@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from sundae_ns.cli.refusals import check_exclusive, check_least
 from sundae_ns.core.errors import ConfigError
-from sundae_ns.core.tables import Share
+from sundae_ns.core.share import Share
 
 T = TypeVar("T")
 # Options that may be left out: their help names the type, not None beside it.

@@ -132,10 +132,8 @@ class Quality:
 @torch.no_grad()
 def evaluate(render: Callable[[AnyCamera], Tensor], cameras: Iterable[AnyCamera], targets: Iterable[Tensor]) -> Quality:
     """Compare the images ``[H, W, 3]`` that ``render`` gives for cameras, at least one, with true ones in [0, 1]."""
-    values = []
-    for camera, target in zip(cameras, targets, strict=True):
-        image = render(camera)
-        values.append([float(metric(image, target.to(image))) for metric in (psnr, ssim)])
+    pairs = ((render(camera), target) for camera, target in zip(cameras, targets, strict=True))
+    values = [[float(metric(image, target.to(image))) for metric in (psnr, ssim)] for image, target in pairs]
     return Quality(*zip(*values, strict=True))
 
 

@@ -1,25 +1,12 @@
-"""Numbers in tables, in JSON and in options."""
+"""Numbers in tables and in JSON."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any
-
-from tyro.constructors import PrimitiveConstructorSpec
+from typing import Any
 
 MEGABYTE = 1e6  # bytes in the MB of tables and plots
-
-
-def _share(words: list[str]) -> float:
-    return float(words[0].removesuffix("%")) / (100 if words[0].endswith("%") else 1)
-
-
-Share = Annotated[
-    float,
-    PrimitiveConstructorSpec(1, "SHARE", _share, lambda value: isinstance(value, float), lambda value: [str(value)]),
-]
-"""A share of the Gaussians in an option: ``0.25`` or ``25%``."""
 
 
 def without_nan(value: Any) -> Any:

@@ -130,7 +130,7 @@ class ShardedSource(GaussianSource):
         numbers = torch.stack([sent, received, sizes[:, 2].long()])
         self._sent, self._received, self.sizes = numbers.tolist()  # waits for the GPU, once a step
         receiver, self._rows = torch.nonzero_static(seen, size=sum(self._sent)).unbind(dim=1)
-        return torch.stack([-viewmat[:3, :3].T @ viewmat[:3, 3] for viewmat in viewmats]), receiver
+        return torch.stack([camera._replace(viewmat=viewmat).center for viewmat in viewmats]), receiver
 
     @torch.no_grad()
     def count_views(self, state: TrainingState, *, absgrad: bool) -> None:

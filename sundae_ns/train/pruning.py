@@ -18,7 +18,8 @@ from torch import Tensor
 
 from sundae_ns.core.errors import ConfigError, SundaeError
 from sundae_ns.core.files import write_text
-from sundae_ns.core.tables import Share, without_nan
+from sundae_ns.core.share import Share
+from sundae_ns.core.tables import without_nan
 from sundae_ns.core.timing import now, peak_memory
 from sundae_ns.io.run_folder import PRUNES, prunes_before
 from sundae_ns.pruning.decision import Pruner

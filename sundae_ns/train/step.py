@@ -104,8 +104,7 @@ def image_losses(
 
 _GAUSSIAN = cv2.getGaussianKernel(SSIM_WINDOW, SIGMA, cv2.CV_32F)
 _C1, _C2 = 0.01**2, 0.03**2
-_HALF = SSIM_WINDOW // 2
-_WINDOWS = (slice(_HALF, -_HALF), slice(_HALF, -_HALF))  # centres of the windows that lie inside the image
+_WINDOWS = 2 * (slice(SSIM_WINDOW // 2, -(SSIM_WINDOW // 2)),)  # centres of the windows that lie inside the image
 
 
 def ssim_loss(image: Tensor, target: Tensor) -> Tensor:
