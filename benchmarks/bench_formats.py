@@ -2,7 +2,6 @@
 
     python benchmarks/bench_formats.py RUN                                   # a run of splatfacto or sundae
     python benchmarks/bench_formats.py RUN -o benchmarks/results/formats.csv
-    python benchmarks/bench_formats.py RUN --ply other.ply other.sog         # files of another program
 
 The formats are fp32 (the run itself), .ply, .spz and .sog by ``sundae export``, .sundae by ``sundae pack`` with the
 head if there is one, and .sog by PlayCanvas's ``splat-transform`` where it is in PATH (``npm install -g
@@ -75,7 +74,7 @@ def packed_files(run: Path, scene: sn.Scene, folder: Path, data: Path | None, pr
         yield Packed(theirs, version_of(words[0]), shlex.join([OTHER, *words[1:], "scene.ply", "scene.sog"]))
 
 
-def rows_of(opened: Opened, method: str, files: Iterator[Packed], scene: sn.Scene) -> Iterator[dict[str, Any]]:
+def rows_of(opened: Opened, files: Iterator[Packed], scene: sn.Scene) -> Iterator[dict[str, Any]]:
     """A row for the run in fp32, then one for each file."""
     cameras = [camera_of(camera, scene.device) for camera in opened.cameras]
 
@@ -85,7 +84,7 @@ def rows_of(opened: Opened, method: str, files: Iterator[Packed], scene: sn.Scen
         quality = sn.measure(shown, opened.truths, cameras)
         figures = (count, round(quality.psnr, 4), round(quality.ssim, 4), measured.num_gaussians)
         seed = "" if opened.seed is None else opened.seed
-        return dict(zip(COLUMNS, (opened.scene, method, kind, program, *figures, seed, command), strict=True))
+        return dict(zip(COLUMNS, (opened.scene, opened.method, kind, program, *figures, seed, command), strict=True))
 
     stored = bytes_of(scene.gaussians) + (0 if scene.head is None else bytes_of_module(scene.head))
     yield row(scene, "fp32", "", stored, f"ns-train {opened.method}")
@@ -99,9 +98,6 @@ def main() -> int:
     parser.add_argument("run", type=Path, help="folder of a finished run of splatfacto or sundae")
     parser.add_argument("-o", "--out", type=Path, help="CSV file to put the rows into")
     parser.add_argument("--data", type=Path, help="the capture, if it has moved")
-    parser.add_argument("--method", help="name in the rows; by default the run's method")
-    parser.add_argument("--ply", type=Path, nargs="+", default=[], metavar="FILE", help="measure these files instead")
-    parser.add_argument("--program", default="other", help="the program that made the files of --ply")
     parser.add_argument("--splat-transform", default=shutil.which(OTHER), help="its command, with options if need be")
     options = parser.parse_args()
 
@@ -109,10 +105,8 @@ def main() -> int:
     scene = sn.load(options.run, device=opened.model.device)
     with tempfile.TemporaryDirectory() as name:
         files = packed_files(options.run, scene, Path(name), options.data, options.splat_transform)
-        if options.ply:
-            files = (Packed(file, options.program, f"{options.program} {file.name}") for file in options.ply)
         rows = Rows(options.out, COLUMNS, PLACE)
-        for row in rows_of(opened, options.method or opened.method, files, scene):
+        for row in rows_of(opened, files, scene):
             rows.put(row)
     return 0
 

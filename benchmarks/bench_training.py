@@ -34,7 +34,6 @@ ARMS: dict[str, list[str]] = {
     "splatfacto": ["splatfacto"],
     "sundae": ["sundae"],
     "sundae-fast": ["sundae-fast"],
-    "sundae-with-head": ["sundae", "--pipeline.model.head.mode", "residual"],
 }
 
 

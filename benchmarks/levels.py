@@ -2,7 +2,6 @@
 
     python benchmarks/levels.py FIELD ... -o benchmarks/results/levels.csv                         # ours, best on a GPU
     python benchmarks/levels.py FIELD ... --tools splat-transform --decimated DIR -o benchmarks/results/levels.csv
-    python benchmarks/levels.py --means benchmarks/results/levels.csv
 
 ``sundae`` makes levels as ``sundae export --lod`` does. Those of ``splat-transform`` are ``DIR/NAME_50.sog`` and so on;
 missing ones are made with ``--splat-transform COMMAND``, by ``--decimate`` on its CPU path. All are written as .sog by
@@ -25,7 +24,7 @@ import torch
 from prune_without_photos import OTHER, decimated, device_of
 
 import sundae_ns as sn
-from harness.rows import Rows, read_rows
+from harness.rows import Rows
 from sundae_ns.plugin.distill import LEVELS, levels_of
 
 COLUMNS = ("field", "share", "tool", "gaussians", "psnr_to_field", "psnr_worst", "seconds", "device")
@@ -76,36 +75,18 @@ def rows_of(path: Path, tool: str, options: argparse.Namespace) -> Iterator[dict
         levels = trained(scene, Path(folder)) if tool == OURS else others(scene, path.stem, options)
         for share, (level, seconds) in zip(LEVELS, levels, strict=True):
             values = [sn.measure(level, [image], [camera]).psnr for image, camera in zip(images, cameras, strict=True)]
-            yield {
-                **{"field": path.stem, "share": share, "tool": tool, "gaussians": level.num_gaussians},
-                **{"psnr_to_field": f"{mean(values):.3f}", "psnr_worst": f"{min(values):.3f}"},
-                **{"seconds": f"{seconds:.1f}", "device": device_of(scene)},
-            }
-
-
-def print_means(path: Path) -> None:
-    """The mean PSNR of both tools by share, over the fields that have both, as lines of Markdown."""
-    found = {(row["tool"], row["field"], row["share"]): float(row["psnr_to_field"]) for row in read_rows(path)}
-    print(f"| share | fields | {OTHER} | {OURS} | gain, dB |\n|---:|---:|---:|---:|---:|")
-    for share in map(str, LEVELS):
-        fields = [field for tool, field, other in found if (tool, other) == (OTHER, share)]
-        both = [field for field in fields if (OURS, field, share) in found]
-        theirs, ours = (mean(found[tool, field, share] for field in both) for tool in (OTHER, OURS))
-        print(f"| {share} | {len(both)} | {theirs:.2f} | {ours:.2f} | {ours - theirs:+.2f} |")
+            figures = (level.num_gaussians, f"{mean(values):.3f}", f"{min(values):.3f}", f"{seconds:.1f}")
+            yield dict(zip(COLUMNS, (path.stem, share, tool, *figures, device_of(scene)), strict=True))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("fields", nargs="*", type=Path, help="files of full fields; their names tell them apart")
+    parser.add_argument("fields", nargs="+", type=Path, help="files of full fields; their names tell them apart")
     parser.add_argument("-o", "--out", type=Path, help="table of results")
     parser.add_argument("--tools", nargs="+", choices=(OURS, OTHER), default=[OURS])
     parser.add_argument("--decimated", type=Path, default=Path("decimated"), help="folder of the other's levels")
     parser.add_argument("--splat-transform", default=OTHER, help="its command, with options if it needs any")
-    parser.add_argument("--means", type=Path, help="print the means of a table, and measure nothing")
     options = parser.parse_args()
-    if options.means is not None:
-        print_means(options.means)
-        return
     rows = Rows(options.out, COLUMNS, ("field", "share", "tool"))
     for path in options.fields:
         for tool in options.tools:

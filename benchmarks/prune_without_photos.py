@@ -9,8 +9,7 @@ with the full field's own images, ``psnr`` and ``ssim`` with the photographs, an
 views that no tool was given with the full field. Tools and rules: ``sundae_ns`` by virtual views (``pairs``, the
 default), and ``splat-transform`` by ``--decimate`` and ``--decimate-adaptive``, on its CPU path. Training is none, or
 that of ``sundae prune --distill``: ``distill`` with a head where it pays, ``distill-no-head`` without. ``bytes`` are of
-the .sundae file, ``bytes_sog`` of the base colours as .sog. With ``-o`` rows that are there are not measured again;
-``--again`` does.
+the .sundae file, ``bytes_sog`` of the base colours as .sog. With ``-o`` rows that are there are not measured again.
 """
 
 from __future__ import annotations
@@ -146,7 +145,6 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=3000, help="steps of a distillation")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--splat-transform", help="command of splat-transform, with options if it needs any")
-    parser.add_argument("--again", action="store_true", help="measure rows that are there again")
     options = parser.parse_args()
     rows, failed = Rows(options.out, COLUMNS, PLACE), 0
     for run in options.runs:
@@ -159,7 +157,7 @@ def main() -> int:
         known = {"capture": full.capture, "device": device_of(full.scene), "seed": options.seed}
         with tempfile.TemporaryDirectory() as folder:
             for job in jobs(options):
-                if {**job, **known} in rows and not options.again:
+                if {**job, **known} in rows:
                     continue
                 try:
                     rows.put(row_of(full, job, options, Path(folder)))

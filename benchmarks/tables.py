@@ -16,7 +16,7 @@ import json
 import re
 import textwrap
 from collections.abc import Callable, Sequence
-from itertools import pairwise
+from itertools import pairwise, zip_longest
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -29,24 +29,14 @@ ROOT = Path(__file__).parents[1]
 MB = 1e6
 METHODS = {
     "splatfacto": "splatfacto, 30,000 steps",
-    "splatfacto-7k": "splatfacto, 7,000 steps",
     "sundae-auto": "**sundae**",
-    "sundae-warm-up": "full field, not pruned",
     "sundae-fast": "sundae-fast",
     "sundae": "sundae, fixed share",
-    "sundae-with-head": "sundae, with a head in any case",
-    "sundae-no-head": "the same Gaussians, no head",
-    "sundae-no-head-bytes": "more Gaussians in place of a head",
     "mcmc": "3DGS-MCMC",
-    "band": "the paper's band rule",
-    "random-no-head": "random Gaussians",
-    "contribution-no-head": "highest contribution, as LightGaussian",
 }
-"""Arms of runs.csv in the order of a table, by the names that readers see."""
+"""Arms of runs.csv that are shown, in the order of a table, by the names that readers see."""
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 MARKED = re.compile(r"(<!-- table: (?P<name>[\w-]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
-LEFT_OUT = ("splatfacto-7k", "sundae-warm-up", "sundae-with-head", "sundae-no-head", "sundae-no-head-bytes", "band")
-"""Methods of runs.csv that the table of quality leaves out; the text gives what they show."""
 SHARE = 0.1
 """Share that ``sundae`` keeps."""
 FORMATS = {".spz": ".spz", ".sog": ".sog", ".sog theirs": ".sog by splat-transform", ".sundae": ".sundae"}
@@ -97,7 +87,7 @@ def quality() -> list[str]:
     compared = {row["scene"] for row in found if row["variant"] in ("sundae", "sundae-auto")}
     for row in found:
         other_share = row["keep_ratio"] != SHARE and (row["scene"], row["variant"]) in usual
-        if other_share or row["variant"] in LEFT_OUT or row["scene"] not in compared:
+        if other_share or row["scene"] not in compared:
             continue
         keep = "" if row["keep_ratio"] in (None, 1.0) else f" ({row['keep_ratio']:.0%})"
         size = f"{number(row['primitives'], 0)}{keep}, {number(row['bytes_total'] / MB, 1)} MB"
@@ -245,23 +235,12 @@ def multi_gpu() -> list[str]:
     heads = ["field", "GPUs", "Gaussians", "images a second", "PSNR, dB", "MiB of a GPU, at most"]
     rows, above = [], ""
     for line in sorted(lines_of("multi_gpu.jsonl"), key=lambda line: (line["variant"], line["ranks"])):
-        field = "tiled, not pruned" if "tiled" in line["variant"] else f"{line['scene']}, whole run"
+        field = f"{line['scene']}, tiled"
         psnr = list(line["psnr_after_images"].values())[-1]
         cells = [f"{line['ranks']} {line['gpu'].removesuffix(' 80GB HBM3').split()[-1]}"]
         figures = ((line["primitives"], 0), (line["images_per_s"], 1), (psnr, 2), (max(line["peak_mib"]), 0))
         rows.append([field if field != above else "", *cells, *(number(*figure) for figure in figures)])
         above = field
-    return table(heads, rows)
-
-
-def trials() -> list[str]:
-    """What held-out training views say of the head."""
-    heads = ["capture", "training views", "held out", "without a head: dB", "SSIM", "with one: dB", "SSIM", "chosen"]
-    rows = []
-    for line in lines_of("trials.csv"):
-        figures = ((f"psnr_{arm}", f"ssim_{arm}") for arm in ("plain", "head"))
-        cells = [number(float(line[name]), digits) for pair in figures for name, digits in zip(pair, (2, 3))]
-        rows.append([line["capture"], line["training_views"], line["held_out"], *cells, line["chosen"]])
     return table(heads, rows)
 
 
@@ -298,6 +277,25 @@ def sizes_asked() -> list[str]:
         scene = row["capture"] + (", trained" if row["source"] == "trained" else "")
         cells[row["asked_mb"], scene] = f"{float(row['got_mb']):.3f}, {float(row['psnr']):.1f}"
     return side_by_side(cells, "MB asked")
+
+
+def stability() -> list[str]:
+    """Errors on hard scenes, image and worst gradient by rasteriser, and beside them on hard sets of points."""
+    rows = lines_of("stability.csv")
+    wrong = {row["case"] for row in rows if row["error"] != "0.0e+00"}
+    exact = ", ".join(dict.fromkeys(row["case"] for row in rows if row["case"] not in wrong))
+    scenes: dict[tuple[str, str], str] = {}
+    points: dict[tuple[str, str], str] = {}
+    for row in rows:
+        if row["what"] == "response":
+            points[row["case"], f"response, {row['device'].upper()}"] = row["error"] or "no responses"
+        elif row["case"] in wrong:
+            scenes[row["case"], row["what"]] = f"{row['error']}, {row['gradients']}"
+        else:
+            scenes[exact, row["what"]] = "0, 0"
+    left, right = side_by_side(scenes, "scene"), side_by_side(points, "points")
+    blank = "|" + "  |" * (right[0].count("|") - 1)
+    return [one + other[1:] for one, other in zip_longest(left, right, fillvalue=blank)]
 
 
 GLUE = "\0"
@@ -343,9 +341,9 @@ def _first(value: Any) -> str:
     return re.sub("`[^`]*`", lambda code: code[0].replace(" ", GLUE), sentence)  # a line must not begin with * or +
 
 
-MAKERS = (quality, speed, training_time, packing, formats, packed_headline, equal_quality, multi_gpu, prune, trials)
+MAKERS = (quality, speed, training_time, packing, formats, packed_headline, equal_quality, multi_gpu, prune)
 TABLES: dict[str, Callable[[], list[str]]] = {
-    make.__name__.replace("_", "-"): make for make in (*MAKERS, sizes_asked, library)
+    make.__name__.replace("_", "-"): make for make in (*MAKERS, sizes_asked, stability, library)
 }
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from harness.rows import Rows, read_rows
+
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "benchmarks"
 SCRIPTS = sorted(path.name for path in FOLDER.glob("*.py"))
@@ -35,3 +37,17 @@ def test_tables_of_all_pages_are_those_of_the_results(monkeypatch):
 def test_results_can_be_read():
     for path in (FOLDER / "results").glob("*.jsonl"):
         assert all(isinstance(json.loads(line), dict) for line in path.read_text().splitlines()), path.name
+
+
+def test_float32_is_compared_with_float64(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(str(FOLDER))
+    stability = runpy.run_path(str(FOLDER / "stability.py"))
+    for name, kept in (("SCENES", "survey coordinates of 1e7"), ("FIELDS", "collinear")):
+        for case in stability[name].keys() - {kept}:
+            del stability[name][case]
+    reference, cpu, response = (float(row[3]) for row in stability["rows_of"](cuda=False))
+    assert all(1e-8 < error < 1e-6 for error in (reference, cpu, response))
+    rows = Rows(tmp_path / "a.csv", ("program", "psnr"), ("program",))
+    for program in ("tool 1", "other 1", "tool 2"):  # another version
+        rows.put({"program": program, "psnr": "1"})
+    assert [row["program"] for row in read_rows(tmp_path / "a.csv")] == ["other 1", "tool 2"]

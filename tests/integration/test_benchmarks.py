@@ -207,16 +207,3 @@ def test_a_program_that_fails_costs_its_own_row_alone(tiny, tmp_path, monkeypatc
     made = [one.file.suffix for one in files(tiny.folder, sn.load(tiny.folder), tmp_path, None, "false --gpu cpu")]
     assert made == [".ply", ".spz", ".sog", ".sundae"]
     assert "false --gpu cpu has failed" in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("short_prunes")
-def test_a_file_of_another_program_takes_the_place_of_its_own_row(tiny, tmp_path, monkeypatch):
-    out, file, scene = tmp_path / "formats.csv", tmp_path / "other.ply", sn.load(tiny.folder)
-    for made in (scene, sn.prune(scene, count=20, cameras=sn.virtual_cameras(scene, 2))):
-        sn.save(made, file)
-        program = f"tool {made.num_gaussians}"
-        run(monkeypatch, "bench_formats.py", tiny.folder, "-o", out, "--ply", file, "--program", program)
-    (row,) = (row for row in formats_in(out) if row["format"] == ".ply")
-    assert (row["program"], row["primitives"]) == ("tool 20", "20")
-    assert len(formats_in(out)) == 2
-    assert 0 < float(row["psnr"]) < 100
