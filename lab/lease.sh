@@ -27,5 +27,5 @@ case $1 in
   wait)
     touch $J/END; SECONDS=0
     until grep -q "all done" /tmp/logs/queue.log || [ $SECONDS -gt $2 ]; do sleep 1; done
-    tar -czf $OUT/out.tgz -C /tmp out logs; awk '/done/' /tmp/logs/queue.log | tail -n 40; grep -l Traceback /tmp/logs/*.log ;;
+    tar -czf $OUT/out.tgz --exclude='*.ckpt' --exclude='events.*' --exclude='*.sundae' -C /tmp out logs; awk '/done/' /tmp/logs/queue.log | tail -n 40; grep -l Traceback /tmp/logs/*.log ;;
 esac
