@@ -437,9 +437,8 @@ def threads():
 
 
 def test_results_do_not_depend_on_the_number_of_threads(threads, monkeypatch):
-    for name in ("backend._MIN_PER_THREAD", "backend._MIN_TO_EVALUATE", "tiles._MIN_PER_THREAD"):
-        monkeypatch.setattr(f"sundae_ns.rasterize.cpu.{name}", 100)
-    monkeypatch.setattr("sundae_ns.rasterize.cpu.compositing._MIN_PER_THREAD_TO_SUM", 100)
+    for module in ("backend", "tiles", "compositing"):
+        monkeypatch.setattr(f"sundae_ns.rasterize.cpu.{module}.MIN_PER_THREAD", 100)
     values, camera = scene(3000), make_view(130, 70)
     values["colors"] = torch.rand(3000, 8)
     directions, coeffs = torch.randn(500, 3), torch.randn(500, 16, 3)
@@ -476,7 +475,7 @@ def test_an_image_of_many_pairs_is_blended_by_regions(monkeypatch):
     compare(render(values, camera, F32, CPU), once, 0.0, 1e-5)
     half = len(regions) // 2
     assert len(regions) == 2 * half >= 10  # the backward pass makes them again
-    assert all(len(region.slots) <= 400 for region in regions)
+    assert all(len(region.places) <= 400 for region in regions)
     drawn_tiles = torch.cat([torch.from_numpy(region.longest_first) for region in regions[:half]])
     assert sorted(drawn_tiles.tolist()) == list(range(70))
     monkeypatch.setattr(tiles, "MOST_PAIRS", 0)  # a tile is not cut

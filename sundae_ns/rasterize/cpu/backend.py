@@ -19,12 +19,10 @@ from sundae_ns.core.errors import BackendError
 from sundae_ns.rasterize import reference
 from sundae_ns.rasterize.cpu.compositing import composite
 from sundae_ns.rasterize.cpu.parallel import as_array, compiled, inlined, parallel_for
-from sundae_ns.rasterize.cpu.tiles import tile_lists
+from sundae_ns.rasterize.cpu.tiles import MIN_PER_THREAD, tile_lists
 from sundae_ns.rasterize.reference import BLUR, FOV_MARGIN, MAX_RADIUS, Projection, blended_values
 from sundae_ns.rasterize.types import Inputs, Rasterization, result_of
 
-_MIN_PER_THREAD = 2_500  # Gaussians to project: below 0.1 ms of work, waking a thread costs more than it saves
-_MIN_TO_EVALUATE = 5_000
 _SHORTEST = 1e-12  # lower bound of a vector's divisor, as in torch's normalize()
 _TERMS = 25  # harmonics of degree 4
 
@@ -53,7 +51,7 @@ class CpuBackend:
         """See :meth:`.Backend.spherical_harmonics`."""
         _check(directions)
         outputs = (torch.empty_like(directions, memory_format=torch.contiguous_format),)
-        loops = _evaluate, _evaluate_backward, _MIN_TO_EVALUATE
+        loops = _evaluate, _evaluate_backward, MIN_PER_THREAD
         return cast("Tensor", _Loops.apply(loops, degree, outputs, 1, directions, coeffs)[0])
 
 
@@ -112,7 +110,7 @@ def project(inputs: Inputs) -> Projection:
     camera = (as_array(viewmat.double()), lens, size, planes.astype(np.float64), limits)
     n = len(means)
     new = (*(means.new_empty(n, *size) for size in ((2,), (3,), (), (), (3,))), means.new_empty(n, dtype=torch.int32))
-    loops = _project, _project_backward, _MIN_PER_THREAD
+    loops = _project, _project_backward, MIN_PER_THREAD
     outputs = _Loops.apply(loops, camera, new, 4, means, inputs.quats, inputs.scales)
     means2d, conics, depths, compensations, covars2d, radii = outputs
     return Projection(means2d, covars2d, conics, depths, compensations, radii)

@@ -37,16 +37,17 @@ from sundae_ns.rasterize.cpu.lanes import (
     zeros,
 )
 from sundae_ns.rasterize.cpu.parallel import as_array, compiled, inlined, parallel_for
-from sundae_ns.rasterize.cpu.tiles import HALF_XX, HALF_YY, OPACITY, TILE, XY, Lists, U, V
+from sundae_ns.rasterize.cpu.tiles import HALF_XX, HALF_YY, MIN_PER_THREAD, OPACITY, TILE, XY, Lists, U, V
 from sundae_ns.rasterize.reference import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 
 _PIXELS = TILE * TILE
 _CHECK_EVERY = 8  # list entries between two checks for opaque tiles
+_AT_HAND = 16  # list entries whose numbers are read together
+_COLORS = OPACITY + 1  # first column of the colours among these numbers
 _FAINTEST = 20.0  # upper bound of negated exponents, far beyond log(255)
-_MIN_PER_THREAD = 8  # tiles
+_MIN_TILES = 8  # tiles that are worth another thread
 _GROUP = 4  # channels whose gradients are summed together: their sums stay in registers, also in those of AVX2
 _MOMENTS = 8  # sums per Gaussian and tile after the channels: six moments, two absolute gradients
-_MIN_PER_THREAD_TO_SUM = 5_000  # Gaussians
 
 
 class _Composite(torch.autograd.Function):
@@ -65,13 +66,11 @@ class _Composite(torch.autograd.Function):
         tiles = -(-width // TILE) * -(-height // TILE)
         image, alpha = (np.zeros((height, width, channels), values.dtype) for channels in (values.shape[1], 1))
         ends = np.empty((2, tiles, _PIXELS), values.dtype)
-        regions = 0
-        for region in lists():
-            regions += 1
+        for before, region in enumerate(lists()):
             arguments = (tuple(region), values, image, alpha, *ends)
-            parallel_for(_blend, len(region.longest_first), *arguments, min_per_thread=_MIN_PER_THREAD)
+            parallel_for(_blend, len(region.longest_first), *arguments, min_per_thread=_MIN_TILES)
+            ctx.lists = lists if before else [region].copy  # lists of several regions may exceed the memory
         ctx.save_for_backward(means2d, conics, opacities, colors)
-        ctx.lists = lists if regions > 1 else lambda: [region]  # lists of several regions may exceed the memory
         ctx.ends, ctx.absgrad = ends, absgrad
         return torch.from_numpy(image), torch.from_numpy(alpha)
 
@@ -86,11 +85,11 @@ class _Composite(torch.autograd.Function):
         outputs = tuple(np.zeros(value.shape, values.dtype) for value in ctx.saved_tensors)
         absolute_grads = np.zeros(means2d.shape if absgrad else (0, 0, 0), values.dtype)
         for region in ctx.lists():
-            parts = np.empty((len(region.slots), padded + _MOMENTS * needs_geometry), values.dtype)
+            parts = np.empty((len(region.ranks), padded + _MOMENTS * needs_geometry), values.dtype)
             arguments = (tuple(region), (values, *ctx.ends), gradients, needs, parts)
-            parallel_for(_blend_backward, len(region.longest_first), *arguments, min_per_thread=_MIN_PER_THREAD)
+            parallel_for(_blend_backward, len(region.longest_first), *arguments, min_per_thread=_MIN_TILES)
             summed = (tuple(region), parts, padded, outputs, absolute_grads)
-            parallel_for(_sum_slots, len(region.ids), *summed, min_per_thread=_MIN_PER_THREAD_TO_SUM)
+            parallel_for(_sum_slots, len(region.ids), *summed, min_per_thread=MIN_PER_THREAD)
         if ctx.absgrad:
             means2d.absgrad = torch.from_numpy(absolute_grads) if absgrad else torch.zeros_like(means2d)
         return *map(torch.from_numpy, outputs), None, None, None
@@ -106,18 +105,9 @@ gradients; width and height; a function that gives the lists of each region, whi
 
 
 @inlined
-def _unclamped_alphas(dx: Any, dy: Any, half_xx: Any, xy: Any, half_yy: Any, opacity: Any) -> Any:
-    exponents = fma(fma(dx, half_xx, dy * xy), dx, dy * dy * half_yy)
-    return exp_negative(minimum(exponents, _FAINTEST)) * opacity
-
-
-@compiled
-def _pixel_centres(like: Any) -> Any:
-    """Coordinates of the pixel centres of a tile: x ``[P]`` and y ``[P]``."""
-    across, down = np.empty(_PIXELS, like.dtype), np.empty(_PIXELS, like.dtype)
-    for p in range(_PIXELS):
-        across[p], down[p] = p % TILE + 0.5, p // TILE + 0.5
-    return across, down
+def _unclamped_alphas(dx: Any, dy: Any, row: Any) -> Any:
+    exponents = fma(fma(dx, row[HALF_XX], dy * row[XY]), dx, dy * dy * row[HALF_YY])
+    return exp_negative(minimum(exponents, _FAINTEST)) * row[OPACITY]
 
 
 @compiled
@@ -127,10 +117,11 @@ def _blend(
     columns, tiles, starts, ranks, _, spans, ids, _, table = lists
     number = table.dtype.type
     height, width, channels = image.shape
-    across, down = _pixel_centres(table)
-    x = load(across, 0)
+    x = load((np.arange(WIDTH) % TILE + 0.5).astype(table.dtype), 0)
+    down = (np.arange(_PIXELS) // TILE + 0.5).astype(table.dtype)
     # Pixels are the fastest axis within a group of WIDTH, then channels.
     summed, blended = np.empty(_PIXELS, table.dtype), np.empty((_PIXELS // WIDTH, channels, WIDTH), table.dtype)
+    gathered = np.empty((_AT_HAND, _COLORS + channels), table.dtype)
     for k in range(begin, end):
         tile = tiles[k]
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
@@ -144,15 +135,15 @@ def _blend(
         blended[:] = 0
         start = starts[tile]
         for entry in range(start, starts[tile + 1]):
-            rank = ranks[entry]
-            color = channels * ids[rank]
-            dx, v = x - (table[rank, U] - number(left)), table[rank, V] - number(top)
-            half_xx, xy, half_yy = table[rank, HALF_XX], table[rank, XY], table[rank, HALF_YY]
-            opacity = table[rank, OPACITY]
+            at_hand = (entry - start) % _AT_HAND
+            if at_hand == 0:
+                _gather(ranks, entry, starts[tile + 1], table, ids, colors, gathered)
+            row = gathered[at_hand]
+            dx, v = x - (row[U] - number(left)), row[V] - number(top)
             place = entry - start + 1
             for step in range(spans[entry, 0], spans[entry, 1]):
                 p = step * WIDTH
-                alphas = minimum(_unclamped_alphas(dx, load(down, p) - v, half_xx, xy, half_yy, opacity), MAX_ALPHA)
+                alphas = minimum(_unclamped_alphas(dx, load(down, p) - v, row), MAX_ALPHA)
                 before = load(through, p)
                 behind = before * (1.0 - alphas)
                 visible = alphas >= MIN_ALPHA
@@ -165,17 +156,27 @@ def _blend(
                 store(summed, p, load(summed, p) + weights)
                 for c in range(channels):
                     at = p * channels + c * WIDTH
-                    store(blended, at, fma(weights, broadcast(colors, color + c), load(blended, at)))
+                    store(blended, at, fma(weights, broadcast(row, _COLORS + c), load(blended, at)))
             if place % _CHECK_EVERY == 0 and not _any_unfinished(through):
                 break
-        for p in range(_PIXELS):
-            through[p] = abs(through[p])
+        through[:] = np.abs(through)
         for y in range(min(TILE, height - top)):
             for x_of_pixel in range(min(TILE, width - left)):
                 p = y * TILE + x_of_pixel
                 for c in range(channels):
                     image[top + y, left + x_of_pixel, c] = blended[p // WIDTH, c, p % WIDTH]
                 alpha_image[top + y, left + x_of_pixel, 0] = summed[p]
+
+
+@inlined
+def _gather(ranks: Any, first: int, end: int, table: Any, ids: Any, colors: Any, gathered: Any) -> None:
+    """Copy what the next entries of a list blend: the processor waits for all of these rows at once."""
+    for k in range(min(end - first, len(gathered))):
+        rank = ranks[first + k]
+        for column in range(_COLORS):
+            gathered[k, column] = table[rank, column]
+        for c in range(colors.shape[1]):
+            gathered[k, _COLORS + c] = colors[ids[rank], c]
 
 
 @inlined
@@ -188,18 +189,19 @@ def _any_unfinished(through: Any) -> bool:
 
 @compiled
 def _blend_backward(begin: int, end: int, lists: Any, blended: Any, gradients: Any, needs: Any, parts: Any) -> None:
-    """Write for each slot the gradients of channels, the moments of dL/de, and the absolute gradient of the centre."""
-    columns, tiles, starts, ranks, slots, spans, ids, _, table = lists
+    """Write the gradients of channels, the moments of dL/de and the absolute gradient of the centre of each entry."""
+    columns, tiles, starts, ranks, _, spans, ids, _, table = lists
     colors, transmittances, last = blended
     grad_image, grad_alpha = gradients
     needs_geometry, needs_colors, absgrad, padded = needs
     number = table.dtype.type
     height, width, channels = grad_image.shape
-    across, down = _pixel_centres(table)
-    x, none = load(across, 0), zeros(table)
+    x, none = load((np.arange(WIDTH) % TILE + 0.5).astype(table.dtype), 0), zeros(table)
+    down = (np.arange(_PIXELS) // TILE + 0.5).astype(table.dtype)
     through, behind = np.empty(_PIXELS, table.dtype), np.empty(_PIXELS, table.dtype)
     weights, grads = np.empty(_PIXELS, table.dtype), np.zeros((_PIXELS // WIDTH, padded, WIDTH), table.dtype)
     alpha_grads = np.zeros(_PIXELS, table.dtype)
+    gathered = np.empty((_AT_HAND, _COLORS + channels), table.dtype)
     for k in range(begin, end):
         tile = tiles[k]
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
@@ -214,20 +216,19 @@ def _blend_backward(begin: int, end: int, lists: Any, blended: Any, gradients: A
                     grads[p // WIDTH, c, p % WIDTH] = grad_image[top + y, left + x_of_pixel, c]
                 alpha_grads[p] = grad_alpha[top + y, left + x_of_pixel, 0]
         start, deepest = starts[tile], int(blended_last.max())
-        for entry in range(start + deepest, starts[tile + 1]):
-            parts[slots[entry]] = 0
+        parts[start + deepest : starts[tile + 1]] = 0
         for place in range(deepest, 0, -1):
             entry = start + place - 1
-            rank = ranks[entry]
-            color = channels * ids[rank]
-            dx, v = x - (table[rank, U] - number(left)), table[rank, V] - number(top)
-            half_xx, xy, half_yy = table[rank, HALF_XX], table[rank, XY], table[rank, HALF_YY]
-            opacity = table[rank, OPACITY]
+            at_hand = (place - 1) % _AT_HAND
+            if place == deepest or at_hand == _AT_HAND - 1:
+                _gather(ranks, entry - at_hand, entry + 1, table, ids, colors, gathered)
+            row = gathered[at_hand]
+            dx, v = x - (row[U] - number(left)), row[V] - number(top)
             m = mx = my = mxx = mxy = myy = absolute_x = absolute_y = none
             for step in range(spans[entry, 0], spans[entry, 1]):
                 p = step * WIDTH
                 dy = load(down, p) - v
-                unclamped = _unclamped_alphas(dx, dy, half_xx, xy, half_yy, opacity)
+                unclamped = _unclamped_alphas(dx, dy, row)
                 alphas = minimum(unclamped, MAX_ALPHA)
                 blends = logical_and(alphas >= MIN_ALPHA, load(blended_last, p) >= place)
                 inverse = 1.0 / (1.0 - alphas)
@@ -238,7 +239,7 @@ def _blend_backward(begin: int, end: int, lists: Any, blended: Any, gradients: A
                     continue
                 store(through, p, select(blends, before, load(through, p)))
                 if needs_geometry:
-                    gain = weight * (load(alpha_grads, p) + _product(grads, p * padded, colors, color, channels))
+                    gain = weight * (load(alpha_grads, p) + _product(grads, p * padded, row, channels))
                     later = load(behind, p)
                     store(behind, p, later + gain)
                     varies = logical_and(blends, unclamped < MAX_ALPHA)
@@ -247,11 +248,11 @@ def _blend_backward(begin: int, end: int, lists: Any, blended: Any, gradients: A
                     m, mx, my = m + grad_exponent, mx + grad_x, my + grad_y
                     mxx, mxy, myy = fma(grad_x, dx, mxx), fma(grad_x, dy, mxy), fma(grad_y, dy, myy)
                     if absgrad:
-                        slope_x = fma(dx, number(2) * half_xx, dy * xy)
-                        slope_y = fma(dx, xy, dy * (number(2) * half_yy))
+                        slope_x = fma(dx, number(2) * row[HALF_XX], dy * row[XY])
+                        slope_y = fma(dx, row[XY], dy * (number(2) * row[HALF_YY]))
                         absolute_x = absolute_x + absolute(grad_exponent * slope_x)
                         absolute_y = absolute_y + absolute(grad_exponent * slope_y)
-            part = slots[entry] * parts.shape[1]
+            part = entry * parts.shape[1]
             if needs_colors:
                 for c in range(0, padded, _GROUP):
                     _sum_channels(weights, grads, spans[entry, 0], spans[entry, 1], c, parts, part + c)
@@ -261,13 +262,13 @@ def _blend_backward(begin: int, end: int, lists: Any, blended: Any, gradients: A
 
 
 @inlined
-def _product(grads: Any, at: int, colors: Any, color: int, channels: int) -> Any:
+def _product(grads: Any, at: int, row: Any, channels: int) -> Any:
     """<g, c> of WIDTH pixels; two sums, whose latencies overlap."""
     even = odd = zeros(grads)
     for c in range(0, channels, 2):
-        even = fma(load(grads, at + c * WIDTH), broadcast(colors, color + c), even)
+        even = fma(load(grads, at + c * WIDTH), broadcast(row, _COLORS + c), even)
         if c + 1 < channels:
-            odd = fma(load(grads, at + c * WIDTH + WIDTH), broadcast(colors, color + c + 1), odd)
+            odd = fma(load(grads, at + c * WIDTH + WIDTH), broadcast(row, _COLORS + c + 1), odd)
     return even + odd
 
 
@@ -286,7 +287,7 @@ def _sum_channels(weights: Any, grads: Any, first: int, beyond: int, channel: in
 @compiled
 def _sum_slots(begin: int, end: int, lists: Any, parts: Any, padded: int, outputs: Any, absolute_grads: Any) -> None:
     """Sum the slots of each Gaussian in float64, convert moments to gradients, and add them to the outputs."""
-    _, _, _, _, _, _, ids, first_slots, table = lists
+    _, _, _, _, places, _, ids, first_slots, table = lists
     grad_means2d, grad_conics, grad_opacities, grad_colors = outputs
     width = parts.shape[1]
     sums = np.empty(width)
@@ -295,7 +296,7 @@ def _sum_slots(begin: int, end: int, lists: Any, parts: Any, padded: int, output
         sums[:] = 0
         for slot in range(first_slots[rank], first_slots[rank + 1]):
             for d in range(width):
-                sums[d] += parts[slot, d]
+                sums[d] += parts[places[slot], d]
         for c in range(grad_colors.shape[1]):
             grad_colors[i, c] += sums[c]
         if width == padded:  # only the colours have gradients

@@ -6,8 +6,8 @@ image is the same, with fewer evaluations. (gsplat 1.5 fits the squares to the o
 of opaque Gaussians from 3 to 3.33 sigma.)
 
 Gaussians are sorted by depth once and are then identified by their rank. A rank owns consecutive slots, one per tile
-that it can touch. The backward pass writes its sums per tile into the slots, so that the sum over the tiles of a
-Gaussian reads adjacent memory in a fixed order.
+that it can touch. They tell where its sums per tile stand, which the backward pass writes in list order, so that the
+sum over the tiles of a Gaussian has a fixed order.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ STEP = WIDTH // TILE  # Rows of pixels of a tile that are blended in one step
 ROUNDING = 1e-3  # Slack on exponents, so that rounding never drops a Gaussian that is blended
 MOST_PAIRS = 1 << 23
 """Pairs of a tile and a Gaussian in memory at a time: 84 MB, and in a backward pass at least six times as much."""
-_MIN_PER_THREAD = 2_500  # Gaussians: below 0.1 ms of work, waking a thread costs more than it saves
+MIN_PER_THREAD = 2_500  # Gaussians: below 0.1 ms of work, waking a thread costs more than it saves
 _DIGIT_BITS = 11  # bits per pass of the radix sort
 
 
@@ -44,7 +44,7 @@ class Lists(NamedTuple):
     longest_first: Any  # [B], int32: tiles with a list, the longest first
     starts: Any  # [T + 1], int64: start of each tile's list
     ranks: Any  # [L], int32, in list order
-    slots: Any  # [L], int32, in list order
+    places: Any  # [L], int32, in the order of the slots: places in the lists
     spans: Any  # [L, 2], uint8, in list order: the steps of a tile that are touched, the last excluded
     ids: Any  # [V], int32: Gaussian of each rank
     first_slots: Any  # [V + 1], int64: first slot of each rank
@@ -70,14 +70,14 @@ def tile_lists(projection: Projection, opacities: Tensor, width: int, height: in
         table, boxes = np.empty((count, 9), depths.dtype), np.empty((count, 4), np.int32)
         first_intervals, first_slots = np.zeros(count + 1, np.int64), np.zeros(count + 1, np.int64)
         measured = (ids, splats, region, table, boxes, first_intervals)
-        parallel_for(_measure, count, *measured, min_per_thread=_MIN_PER_THREAD)
+        parallel_for(_measure, count, *measured, min_per_thread=MIN_PER_THREAD)
         np.cumsum(first_intervals, out=first_intervals)
         halves = _halves(*region)
         pairs = int(first_intervals[-1])  # a Gaussian touches at least one tile in each of its columns
         if pairs <= MOST_PAIRS or not halves:
             intervals = np.empty((pairs, 2), np.int32)
             touched = (table, boxes, first_intervals, intervals, first_slots)
-            parallel_for(_find_intervals, count, *touched, min_per_thread=_MIN_PER_THREAD)
+            parallel_for(_find_intervals, count, *touched, min_per_thread=MIN_PER_THREAD)
             np.cumsum(first_slots, out=first_slots)
             pairs = int(first_slots[-1])
         if not projection.means2d.requires_grad:
@@ -86,10 +86,10 @@ def tile_lists(projection: Projection, opacities: Tensor, width: int, height: in
             regions += halves
             continue
         listed += pairs
-        starts, ranks, slots, spans = _sort_by_tile(boxes, first_intervals, intervals, first_slots, columns, rows)
+        starts, ranks, places, spans = _sort_by_tile(boxes, first_intervals, intervals, first_slots, columns, rows)
         lengths = np.diff(starts)
         longest_first = np.argsort(-lengths, kind="stable").astype(np.int32)[: np.count_nonzero(lengths)]
-        yield Lists(columns, longest_first, starts, ranks, slots, spans, ids, first_slots, table)
+        yield Lists(columns, longest_first, starts, ranks, places, spans, ids, first_slots, table)
 
 
 def _halves(left: int, top: int, right: int, bottom: int) -> list[tuple[int, int, int, int]]:
@@ -220,7 +220,7 @@ def _sort_by_tile(
     for tile in range(columns * rows):
         starts[tile + 1] += starts[tile]
     count = first_slots[-1]
-    ranks, slots, spans = np.empty(count, np.int32), np.empty(count, np.int32), np.empty((count, 2), np.uint8)
+    ranks, places, spans = np.empty(count, np.int32), np.empty(count, np.int32), np.empty((count, 2), np.uint8)
     ends: Any = starts.copy()
     slot = 0
     for rank in range(len(first_intervals) - 1):
@@ -231,10 +231,10 @@ def _sort_by_tile(
             for _ in range(_num_tiles(first, beyond)):
                 tile = row * columns + column
                 place = ends[tile]
-                ranks[place], slots[place] = rank, slot
+                ranks[place], places[slot] = rank, place
                 spans[place, 0] = max(first - row * TILE, 0) // STEP
                 spans[place, 1] = (min(beyond - row * TILE, TILE) + STEP - 1) // STEP
                 ends[tile] += 1
                 slot += 1
                 row += 1
-    return starts, ranks, slots, spans
+    return starts, ranks, places, spans
