@@ -1,0 +1,55 @@
+"""Held-out and test figures after each window of a run of few views that never rests: rest_curves.py CAPTURE OUT [--seed K WORD ...]"""
+
+import json
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+import harness.job as job_module  # noqa: E402
+from harness.plan import Job, parser_of  # noqa: E402
+from sundae_ns.train import choice, trials  # noqa: E402
+
+capture, out, *words = sys.argv[1:]
+data = Path(capture)
+parser = list(parser_of(data))
+if any(path.name.startswith("eval_") for path in (data / "images").iterdir()):
+    at = parser.index("interval")
+    parser = [*parser[:at], "filename", *parser[at + 3 :]]
+seed = 42
+if words and words[0] == "--seed":
+    seed, words = int(words[1]), words[2:]
+made, rows = {}, []
+trainer_of, measure = job_module.trainer_of, trials.Trials.measure
+
+
+def keep_trainer(config, *ranks):
+    made["trainer"], save = trainer_of(config, *ranks)
+    return made["trainer"], save
+
+
+def measure_both(self, run):
+    stage = self.progress.stage
+    found = measure(self, run)
+    if stage == "length":
+        pipeline = made["trainer"].pipeline
+        with self._mean.shown(trials.weights_of(run.state)):
+            held = trials.measure_heldout(run, with_fitted=True)
+            test = pipeline.get_average_eval_image_metrics()
+        rows.append({"step": run.state.schedule_step, "held": [list(view) for view in held], "test": {k: float(v) for k, v in test.items()}})
+    return found
+
+
+job_module.trainer_of = keep_trainer
+trials.Trials.measure = measure_both
+trials.WATCHED_SHARE = 1.0
+choice.best_length = lambda *given: (1, False)
+words = ["--pipeline.model.evaluate-prune", "False", *words]
+name = f"rest-{data.name}-{seed}"
+job = Job(name, "whole", data.name, "rest", str(data), "sundae", 30000, seed, options=tuple(words), parser=tuple(parser))
+folder = Path(out) / name
+config, command = job_module.configure(job, folder)
+_, measured = job_module._measured(job, config, command)
+plain = measured.as_json()
+record = json.loads(next(folder.glob("jobs/*/*/*/run/trials.json")).read_text())
+final = plain["configurations"][0]["mean"]
+Path(out, f"{name}.json").write_text(json.dumps({"capture": data.name, "seed": seed, "count": plain["primitives"], "rows": rows, "final": final, "trials": record}) + "\n")
