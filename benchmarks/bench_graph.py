@@ -123,8 +123,6 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5, help="timed runs; their median counts")
     parser.add_argument("--sample", type=int, default=100_000, help="rows compared with scipy")
     options = parser.parse_args()
-    if options.repeats < 1 or options.sample < 1 or min(options.points) <= NEIGHBORS:
-        parser.error(f"give at least one repeat and more than {NEIGHBORS} points")
     threads = f"{os.cpu_count()} threads for neighbours, {torch.get_num_threads()} for torch"
     name = torch.cuda.get_device_name() if options.device == "cuda" else f"CPU, {threads}"
     for n in options.points:

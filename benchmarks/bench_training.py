@@ -30,27 +30,22 @@ from harness.plan import Job, parser_of
 from sundae_ns.core.metrics import psnr, ssim
 from sundae_ns.core.timing import now
 
-ARMS: dict[str, list[str]] = {
-    "splatfacto": ["splatfacto"],
-    "sundae": ["sundae"],
-    "sundae-fast": ["sundae-fast"],
-}
+ARMS = ("splatfacto", "sundae", "sundae-fast")
 
 
 def steps_of(options: argparse.Namespace, arm: str) -> int:
     """Length of a training: by default that of the method."""
-    config: Any = all_methods[ARMS[arm][0]]
+    config: Any = all_methods[arm]
     return int(options.steps or config.max_num_iterations)
 
 
 def trainer_of_arm(options: argparse.Namespace, arm: str, out: str) -> Any:
     """A trainer that is set up."""
-    method, *words = ARMS[arm]
-    words += ["--viewer.quit-on-train-completion", "True", "--pipeline.datamanager.cache-images", "gpu"]
-    if method != "splatfacto":
+    words = ["--viewer.quit-on-train-completion", "True", "--pipeline.datamanager.cache-images", "gpu"]
+    if arm != "splatfacto":
         words += ["--pipeline.model.evaluate-prune", "False"]
     parser, capture = parser_of(options.capture), options.capture
-    job = Job(arm, "whole", capture.name, arm, str(capture), method, steps_of(options, arm), options.seed)
+    job = Job(arm, "whole", capture.name, arm, str(capture), arm, steps_of(options, arm), options.seed)
     job = replace(job, options=(*words, *options.option), parser=parser)
     return trainer_of(configure(job, Path(out))[0])[0]
 

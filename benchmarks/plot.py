@@ -1,6 +1,6 @@
 """Draw the plots of docs/results.md from benchmarks/results, into docs/figures.
 
-python benchmarks/plot.py            # curve.png, rules.png, time.png
+python benchmarks/plot.py            # curve.png, error.png, asked.png
 python benchmarks/plot.py curve      # one of them
 """
 
@@ -16,23 +16,22 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.ticker import NullFormatter
-from tables import MB, lines_of
+from tables import MB, defaults, lines_of, mean, stock_in
 
 FIGURES = Path(__file__).parents[1] / "docs" / "figures"
-PRUNED = ("bonsai", "fox")
-"""Captures whose pruning rules are compared."""
-ARMS = {"splatfacto": "gray", "sundae": "tab:red", "sundae-fast": "tab:blue"}
-"""Methods whose trainings are timed, and their colours."""
-KEPT_RULES = {
-    "detail-merge": "detail, merged (default)",
-    "detail": "detail",
-    "response-contribution": "response x contribution",
-    "contribution": "contribution, sampled",
-    "contribution-top": "highest contribution",
-    "random": "random",
-    "paper": "paper's band",
+STYLES = {
+    "splatfacto": ("s", "gray"),
+    "splatfacto, .sog": ("^", "gray"),
+    "sundae": ("o", "tab:red"),
+    "sundae, fine-tuned": ("P", "tab:red"),
+    "sundae-fast": ("D", "tab:blue"),
+    "fixed shares": ("o", "tab:blue"),
 }
-"""Rules of the plot, by the names that readers see."""
+"""Markers and colours of methods."""
+
+
+RULES = {"detail-merge": "default", "contribution-top": "contribution", "random": "random", "paper": "paper's band"}
+"""Rules of the prune that are shown, and their names."""
 
 
 def logarithmic(panel: Any, ticks: list[float]) -> None:
@@ -40,105 +39,147 @@ def logarithmic(panel: Any, ticks: list[float]) -> None:
     panel.xaxis.set_major_formatter("{x:g}")
     panel.xaxis.set_minor_formatter(NullFormatter())
     panel.set_xticks(ticks)
-    panel.grid(alpha=0.3)
+
+
+def legend(figure: Any) -> None:
+    """One legend for all panels."""
+    found = [panel.get_legend_handles_labels() for panel in figure.axes]
+    seen = {name: line for handles, names in found for line, name in zip(handles, names, strict=True)}
+    figure.legend(seen.values(), seen, fontsize=9, loc="outside lower center", ncols=4)
 
 
 def plot_curve() -> Any:
     """PSNR and SSIM of packed scenes by size: fixed shares, what the default has chosen, and its fine-tuned pack."""
     rows = [row for row in lines_of("curve.csv") if row["seed"] == "42"]
-    packs = [row for row in lines_of("formats.csv") if row["format"] == ".sundae"]
-    stock = {row["capture"]: row for row in packs if row["method"] == "splatfacto"}
+    packs = [row for row in lines_of("formats.csv") if (row["format"], row["method"]) == (".sundae", "splatfacto")]
     captures = list(dict.fromkeys(row["capture"] for row in rows))
-    size = (3 * len(captures), 5.5)
-    figure, panels = plt.subplots(2, len(captures), figsize=size, layout="constrained", sharex="col")
-    for column, capture in zip(panels.T, captures, strict=True):
-        own = [row for row in rows if row["capture"] == capture]
-        fixed = [row for row in own if row["chosen"] == "no" and row["method"] == "sundae"]
-        fixed.sort(key=lambda row: float(row["share"]))
-        for panel, metric in zip(column, ("psnr", "ssim"), strict=True):
-            sizes = [int(row["packed_bytes"]) / MB for row in fixed]
-            values = [float(row[f"packed_{metric}"]) for row in fixed]
-            panel.plot(sizes, values, "-", color="tab:blue", label="fixed shares")
-            for row, x, y in zip(fixed, sizes, values, strict=True):
-                panel.plot(x, y, "o", color="tab:blue", markerfacecolor="tab:blue" if row["head"] == "yes" else "white")
-                share = f"{100 * float(row['share']):g}%"
-                panel.annotate(share, (x, y), (4, -10), textcoords="offset points", fontsize=7)
-            for row in own:
-                if row["chosen"] == "yes":
-                    place = int(row["packed_bytes"]) / MB, float(row[f"packed_{metric}"])
-                    shown = "tab:red" if row["head"] == "yes" else "white"
-                    panel.plot(*place, "D", color="tab:red", markerfacecolor=shown, markersize=8, label="sundae")
-                    if row["tuned_bytes"]:
-                        place = int(row["tuned_bytes"]) / MB, float(row[f"tuned_{metric}"])
-                        panel.plot(*place, "P", color="tab:red", markersize=8, label="sundae, fine-tuned")
-            if capture in stock:
-                place = int(stock[capture]["bytes"]) / MB, float(stock[capture][metric])
-                panel.plot(*place, "s", color="gray", label="splatfacto")
-            logarithmic(panel, [0.3, 1, 3, 10])
-            panel.margins(y=0.12)
-        column[0].set_title(capture, fontsize=10)
-        column[1].set_xlabel("MB, packed")
+    layout: dict[str, Any] = {"figsize": (3 * len(captures), 5.5), "layout": "constrained", "sharex": "col"}
+    figure, panels = plt.subplots(2, len(captures), **layout)
+    for number, panel in enumerate(panels.flat):
+        capture, metric = captures[number % len(captures)], "ssim" if number >= len(captures) else "psnr"
+        own = [row for row in rows if (row["capture"], row["method"]) == (capture, "sundae")]
+        own.sort(key=lambda row: float(row["share"]))
+        fixed, chosen = ([row for row in own if row["chosen"] == word] for word in ("no", "yes"))
+        stock = [row for row in packs if row["capture"] == capture]
+        kinds = [("packed_", fixed, "o-", "fixed shares"), ("packed_", chosen, "D", "sundae")]
+        kinds += [("tuned_", chosen, "P", "sundae, fine-tuned"), ("", stock, "s", "splatfacto")]
+        for kind, found, marker, label in kinds:
+            places = [(int(row[f"{kind}bytes"]) / MB, float(row[f"{kind}{metric}"])) for row in found]
+            color = STYLES[label][1]
+            panel.plot(*zip(*places), marker, color=color, label=label, markersize=7)
+            for place, row in zip(places, found, strict=True):
+                if kind == "packed_" and row["head"] == "no":
+                    panel.plot(*place, marker[0], color=color, markerfacecolor="white", markersize=7)
+                if found is fixed:
+                    share = f"{100 * float(row['share']):g}%"
+                    panel.annotate(share, place, (4, -10), textcoords="offset points", fontsize=7)
+        logarithmic(panel, [0.3, 1, 3, 10])
+        panel.margins(y=0.12)
+        panel.set(**({"title": capture} if metric == "psnr" else {"xlabel": "MB, packed"}))
     panels[0, 0].set_ylabel("test PSNR, dB")
     panels[1, 0].set_ylabel("test SSIM")
-    seen = {name: line for panel in panels.flat for line, name in zip(*panel.get_legend_handles_labels(), strict=True)}
-    figure.legend(seen.values(), seen, fontsize=9, loc="outside lower center", ncols=3)
     return figure
 
 
-def plot_rules() -> Any:
-    """PSNR of pruning rules against the share they keep, over random Gaussians, a panel for each capture."""
-    figure, panels = plt.subplots(1, len(PRUNED), figsize=(5.5 * len(PRUNED), 4), layout="constrained")
-    for panel, scene in zip(panels, PRUNED, strict=True):
-        lines = [line for line in lines_of("rules.csv") if line["scene"] == scene]
-        psnr = {(line["rule"], float(line["keep"])): float(line["psnr"]) for line in lines}
-        keeps = sorted({keep for _, keep in psnr})
-        for rule, name in KEPT_RULES.items():
-            gains = [psnr[rule, keep] - psnr["random", keep] for keep in keeps]
-            width = 2.5 if rule == "detail-merge" else 1.2
-            panel.plot([f"{keep:.0%}" for keep in keeps], gains, "o-", label=name, linewidth=width)
-        panel.set_title(f"{scene}, 15,000 steps after the prune, no head", fontsize=9)
-        panel.set_xlabel("Gaussians kept")
-        panel.set_ylabel("test PSNR over random Gaussians, dB")
-        panel.grid(alpha=0.3)
-    figure.legend(*panels[0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=4)
+def plot_error() -> Any:
+    """Quality against time and size, in decibels over stock, and the error of the graph's response against time."""
+    marks = [(0, row["scene"], row["arm"], row["train_s"], row["psnr"]) for row in lines_of("training_time.jsonl")]
+    for capture, files in stock_in(dict).items():
+        for kind, method in ((".sundae", "splatfacto"), (".sog theirs", "splatfacto, .sog")):
+            if kind in files:
+                marks.append((1, capture, method, files[kind]["bytes"] / MB, files[kind]["psnr"]))
+    for capture, rows in defaults().items():
+        for kind, method in (("packed", "sundae"), ("tuned", "sundae, fine-tuned")):
+            marks.append((1, capture, method, mean(rows, f"{kind}_bytes") / MB, mean(rows, f"{kind}_psnr")))
+    for row in lines_of("frames.jsonl"):
+        capture, method, *_ = row["config"].split(", ")
+        marks.append((2, capture, method, row["ms_frame"], row["psnr"]))
+    stock = {(place, capture): psnr for place, capture, method, _, psnr in marks if method == "splatfacto"}
+    figure, ((seconds, sizes), (frames, graph)) = plt.subplots(2, 2, figsize=(10, 7.5), layout="constrained")
+    panels = (seconds, sizes, frames)
+    for (place, capture), zero in stock.items():
+        own = sorted((x, psnr - zero, method) for *where, method, x, psnr in marks if where == [place, capture])
+        color = f"C{sorted({name for _, name in stock}).index(capture)}"
+        panels[place].plot([x for x, *_ in own], [y for _, y, _ in own], color=color, linewidth=0.7, zorder=1)
+        for x, y, method in own:
+            panels[place].plot(x, y, STYLES[method][0], color=STYLES[method][1], label=method)
+        best = max(own, key=lambda mark: mark[1])
+        offset = (6, -10 if capture == "dinosaur" else 5)  # beside stone_horse
+        panels[place].annotate(capture, best[:2], offset, textcoords="offset points", fontsize=8, color=color)
+    for panel, label in zip(panels, ("seconds of training", "MB, packed", "milliseconds a frame")):
+        panel.set(xlabel=label, ylabel="test PSNR over splatfacto's, dB")
+        panel.margins(0.16, 0.1)
+    logarithmic(seconds, [30, 100, 300])
+    logarithmic(sizes, [0.3, 1, 3, 10])
+    frames.set_xlim(0)
+    for row in (row for row in lines_of("graph.jsonl") if row["distribution"] in ("field", "uniform")):
+        label, color = ("H100", "tab:green") if row["device"] == "cuda" else ("CPU", "tab:orange")
+        spot = row["seconds"], row["response_rel_error"]
+        graph.plot(*spot, "v", color=color, label=f"graph and response, {label}")
+        graph.annotate(f"{row['points'] / 1e6:g}M", spot, (4, 5), textcoords="offset points", fontsize=7)
+    graph.set(xlabel="seconds for millions of points", ylabel="relative error of the response", yscale="log")
+    logarithmic(graph, [0.01, 0.1, 1])
     return figure
 
 
-def plot_time() -> Any:
-    """PSNR of the test views against the seconds of a training, a panel for each capture that has curves, if any."""
-    rows = [row for row in lines_of("training_time.jsonl") if row.get("curve")]
-    if not rows:
-        return None
-    captures = list(dict.fromkeys(row["scene"] for row in rows))
-    size = (3.2 * len(captures), 2.9)
-    figure, (panels,) = plt.subplots(1, len(captures), figsize=size, layout="constrained", squeeze=False)
-    for panel, capture in zip(panels, captures, strict=True):
-        for row in (row for row in rows if row["scene"] == capture):
-            points = [*(point[:2] for point in row["curve"]), [row["train_s"], row["psnr"]]]
-            panel.plot(*zip(*points, strict=True), color=ARMS[row["arm"]], label=row["arm"])
-            panel.plot(*points[-1], "o", color=ARMS[row["arm"]])
-        panel.set_title(capture, fontsize=10)
-        logarithmic(panel, [3, 10, 30, 100, 300])
-        panel.set_xlabel("seconds of training")
-    panels[0].set_ylabel("test PSNR, dB")
-    figure.legend(*panels[0].get_legend_handles_labels(), fontsize=9, loc="outside lower center", ncols=3)
+def lines(panel: Any, name: str, series: Callable[[dict[str, Any]], Any], x: str, y: str) -> None:
+    """Means of a file's column ``y`` over its ``x``, a line for each ``series`` of rows; None leaves a row out."""
+    groups: dict[str, dict[Any, list[dict[str, Any]]]] = {}
+    for row in lines_of(name):
+        if label := series(row):
+            at = row[x] if x == "capture" else float(row[x].partition("%")[0])
+            groups.setdefault(label, {}).setdefault(at, []).append(row)
+    for marker, (label, rows) in zip("osD^vPX*hd" * 2, groups.items()):
+        line = marker if x in ("capture", "psnr_lost") else f"{marker}-"
+        panel.plot(sorted(rows), [mean(rows[at], y) for at in sorted(rows)], line, label=label, fillstyle="none")
+    panel.legend(fontsize=7)
+
+
+def few_photos(row: dict[str, Any]) -> str | None:
+    _, percent, rest = row["arm"].partition("%")
+    fixed = percent and row["views"] in ("12", "16") and rest in ("", " with the rest")
+    return f"{row['views']} views{rest.replace(' with the', ', early')}" if fixed else None
+
+
+def changed_light(row: dict[str, Any]) -> str | None:
+    mode, _, kind = row["arm"].partition(", ")
+    return f"compensation {mode}" if kind == "default, exposures changed" else None
+
+
+def plot_asked() -> Any:
+    """Asked sizes, levels of detail, cleaning, few photos, changed exposures and rules of pruning, a panel each."""
+    figure, ((sizes, levels, cleaning), (few, light, rules)) = plt.subplots(2, 3, figsize=(11, 7), layout="constrained")
+    lines(sizes, "sizes_asked.csv", lambda row: f"{row['capture']} ({row['source']})", "got_mb", "psnr")
+    lines(levels, "levels.csv", lambda row: row["tool"], "share", "psnr_to_field")
+    lines(few, "few_counts.csv", few_photos, "arm", "psnr")
+    lines(light, "gains.csv", changed_light, "capture", "psnr")
+    lines(cleaning, "cleaning.csv", lambda row: row["others_removed"] and row["strength"], "psnr_lost", "removed")
+    sizes.set(title="asked sizes", xlabel="MB got", ylabel="PSNR, dB")
+    levels.set(title="levels, mean of fields", xlabel="share of Gaussians", ylabel="PSNR to the field, dB")
+    cleaning.set(title="cleaning by strength", xlabel="PSNR lost, dB", ylabel="floaters found of 400", ylim=(0, 400))
+    few.set(title="few photos, mean of captures", xlabel="Gaussians kept, %", ylabel="test PSNR, dB")
+    light.set(title="exposures changed by 15%", ylabel="test PSNR, dB")
+    light.margins(0.3)
+    lines(rules, "rules.csv", lambda row: row["scene"] == "bonsai" and RULES.get(row["rule"]), "keep", "psnr")
+    rules.set(title="rules, bonsai, no head", xlabel="share of Gaussians", ylabel="test PSNR, dB")
     return figure
 
 
-PLOTS: dict[str, Callable[[], Any]] = {"curve": plot_curve, "rules": plot_rules, "time": plot_time}
+PLOTS: dict[str, Callable[[], Any]] = {"curve": plot_curve, "error": plot_error, "asked": plot_asked}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("plot", nargs="?", choices=PLOTS, help="by default all")
-    parser.add_argument("-o", "--out", type=Path, default=FIGURES, help="folder")
     options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
     for name in [options.plot] if options.plot else PLOTS:
         figure = PLOTS[name]()
-        if figure is not None:
-            figure.savefig(options.out / f"{name}.png", dpi=110)
-        print(f"{name}.png has no rows yet" if figure is None else f"wrote {name}.png")
+        for panel in figure.axes:
+            panel.grid(alpha=0.3)
+        if figure.axes[0].get_legend() is None:
+            legend(figure)
+        figure.savefig(FIGURES / f"{name}.png", dpi=110)
+        print(f"wrote {name}.png")
 
 
 if __name__ == "__main__":

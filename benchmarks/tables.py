@@ -37,8 +37,6 @@ METHODS = {
 """Arms of runs.csv that are shown, in the order of a table, by the names that readers see."""
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 MARKED = re.compile(r"(<!-- table: (?P<name>[\w-]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
-SHARE = 0.1
-"""Share that ``sundae`` keeps."""
 FORMATS = {".spz": ".spz", ".sog": ".sog", ".sog theirs": ".sog by splat-transform", ".sundae": ".sundae"}
 """Packed formats in the order of a table, by the heads that readers see."""
 
@@ -51,49 +49,28 @@ def lines_of(name: str) -> list[dict[str, Any]]:
     return list(csv.DictReader(text.splitlines()))
 
 
-def runs() -> list[dict[str, Any]]:
-    """Rows of runs.csv by capture, in the order of :data:`METHODS` and of shares, a row for all seeds.
-
-    Numbers are means over the seeds, and None is an empty cell; ``psnr_cell`` and ``ssim_cell`` are texts with the
-    spread.
-    """
-    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-    for row in lines_of("runs.csv"):
-        if row["variant"] in METHODS:
-            # What trials keep differs from seed to seed.
-            share = SHARE if row["variant"] == "sundae-auto" else float(row["keep_ratio"] or 0)
-            groups.setdefault((row["scene"], list(METHODS).index(row["variant"]), share), []).append(row)
-    return [_mean_of(groups[place]) for place in sorted(groups)]
-
-
-def _mean_of(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    words = ("scene", "method", "variant", "resolution", "gpu", "command", "lpips_net")
-    mean: dict[str, Any] = {name: rows[0][name] for name in words}
-    for name in rows[0].keys() - mean.keys():
-        cells = [float(row[name]) if row[name] else None for row in rows]
-        known = [cell for cell in cells if cell is not None]
-        mean[name] = fmean(known) if len(known) == len(cells) else None
-        if name in ("psnr", "ssim"):
-            mean[f"{name}_cell"] = spread(cells, 2 if name == "psnr" else 4)
-    # A mean of equal shares need not be that share.
-    share = None if mean["keep_ratio"] is None else round(mean["keep_ratio"], 4)
-    return {**mean, "keep_ratio": share}
+def runs() -> dict[tuple[str, str], list[dict[str, Any]]]:
+    """Rows of runs.csv by capture and method, a row for each seed, in the order of :data:`METHODS`."""
+    rows, groups = lines_of("runs.csv"), {}
+    for scene in sorted({row["scene"] for row in rows}):
+        for method in METHODS:
+            own = [row for row in rows if (row["scene"], row["variant"]) == (scene, method)]
+            if own := [row for row in own if method == "sundae-auto" or row["keep_ratio"] in ("", "1.0", "0.1")]:
+                groups[scene, method] = own
+    return groups
 
 
 def quality() -> list[str]:
     """All methods on the captures: quality and size; :func:`speed` has times, because suites share their GPUs."""
-    found, cells = runs(), {}
-    usual = {(row["scene"], row["variant"]) for row in found if row["keep_ratio"] == SHARE}
-    compared = {row["scene"] for row in found if row["variant"] in ("sundae", "sundae-auto")}
-    for row in found:
-        other_share = row["keep_ratio"] != SHARE and (row["scene"], row["variant"]) in usual
-        if other_share or row["scene"] not in compared:
-            continue
-        keep = "" if row["keep_ratio"] in (None, 1.0) else f" ({row['keep_ratio']:.0%})"
-        size = f"{number(row['primitives'], 0)}{keep}, {number(row['bytes_total'] / MB, 1)} MB"
-        base = f"<br>head off: {number(row['psnr_base'], 2)}" if row["bytes_head"] else ""
-        capture = f"{row['scene']}, {row['resolution'].replace('x', ' x ')}"
-        cells[capture, METHODS[row["variant"]]] = f"{row['psnr_cell']}, {row['ssim_cell']}<br>{size}{base}"
+    cells = {}
+    for (scene, method), rows in runs().items():
+        errors = ", ".join(spread([float(row[name]) for row in rows], n) for name, n in (("psnr", 2), ("ssim", 4)))
+        keep = mean(rows, "keep_ratio") if rows[0]["keep_ratio"] else 1.0
+        share = "" if keep == 1.0 else f" ({keep:.0%})"
+        size = f"{number(mean(rows, 'primitives'), 0)}{share}, {number(mean(rows, 'bytes_total') / MB, 1)} MB"
+        base = f"<br>head off: {number(mean(rows, 'psnr_base'), 2)}" if mean(rows, "bytes_head") else ""
+        capture = f"{scene}, {rows[0]['resolution'].replace('x', ' x ')}"
+        cells[capture, METHODS[method]] = f"{errors}<br>{size}{base}"
     return side_by_side(cells)
 
 
@@ -129,18 +106,18 @@ def training_time() -> list[str]:
 
 def packing() -> list[str]:
     """What the default keeps of each capture, and its packs without and with a fine-tune, by means over seeds."""
-    stock, made = {row["scene"]: row for row in runs() if row["variant"] == "splatfacto"}, []
-    for capture, rows in _defaults().items():
-        count, head = _mean(rows, "primitives"), "yes" if rows[0]["head"] == "yes" else ""
-        cells = [capture, _quality([stock[capture]], ""), number(count, 0), head, _quality(rows, "")]
-        packed, tuned = (_mean(rows, f"{kind}_bytes") for kind in ("packed", "tuned"))
+    stock, made = runs(), []
+    for capture, rows in defaults().items():
+        count, head = mean(rows, "primitives"), "yes" if rows[0]["head"] == "yes" else ""
+        cells = [capture, _quality(stock[capture, "splatfacto"], ""), number(count, 0), head, _quality(rows, "")]
+        packed, tuned = (mean(rows, f"{kind}_bytes") for kind in ("packed", "tuned"))
         cells += [number(packed / MB, 1), _quality(rows, "packed_")]
         cells += [number(tuned / MB, 2), number(8 * tuned / count, 0), _quality(rows, "tuned_")]
         made.append(cells)
     return table("capture,stock,kept,head,sundae,MB,packed,MB,bits,fine-tuned".split(","), made)
 
 
-def _defaults() -> dict[str, list[dict[str, Any]]]:
+def defaults() -> dict[str, list[dict[str, Any]]]:
     """Rows of curve.csv that the default has chosen, one for each seed, by capture."""
     chosen: dict[str, list[dict[str, Any]]] = {}
     for row in (row for row in lines_of("curve.csv") if row["chosen"] == "yes"):
@@ -148,19 +125,19 @@ def _defaults() -> dict[str, list[dict[str, Any]]]:
     return chosen
 
 
-def _mean(rows: Sequence[dict[str, Any]], name: str) -> float:
+def mean(rows: Sequence[dict[str, Any]], name: str) -> float:
     return fmean(float(row[name]) for row in rows)
 
 
 def _quality(rows: Sequence[dict[str, Any]], kind: str) -> str:
     """PSNR, of what is kept with its spread, and SSIM over the seeds of a capture: ``31.51 ± 0.04, 0.928``."""
-    decibels = number(_mean(rows, f"{kind}psnr"), 2) if kind else spread([float(row["psnr"]) for row in rows], 2)
-    return f"{decibels}, {_mean(rows, f'{kind}ssim'):.3f}"
+    decibels = number(mean(rows, f"{kind}psnr"), 2) if kind else spread([float(row["psnr"]) for row in rows], 2)
+    return f"{decibels}, {mean(rows, f'{kind}ssim'):.3f}"
 
 
 def formats() -> list[str]:
     """Stock runs in fp32 and in each packed format: MB of the whole file, PSNR in dB, and SSIM of the test views."""
-    stock = _stock(lambda row: f"{number(row['bytes'] / MB, 1)}, {number(row['psnr'], 2)}, {row['ssim']:.3f}")
+    stock = stock_in(lambda row: f"{number(row['bytes'] / MB, 1)}, {number(row['psnr'], 2)}, {row['ssim']:.3f}")
     rows = [[capture, *(cells.get(kind, "") for kind in ("fp32", *FORMATS))] for capture, cells in stock.items()]
     return table(["capture", "fp32", *FORMATS.values()], rows, words=1)
 
@@ -171,16 +148,16 @@ def packed_headline() -> list[str]:
     def cell(size: float, psnr: float) -> str:
         return f"{number(size / MB, 1)}, {number(psnr, 1)}"
 
-    stock = _stock(lambda row: cell(row["bytes"], row["psnr"]))
+    stock = stock_in(lambda row: cell(row["bytes"], row["psnr"]))
     rows = []
-    for capture, found in _defaults().items():
-        ours = (cell(_mean(found, f"{kind}_bytes"), _mean(found, f"{kind}_psnr")) for kind in ("packed", "tuned"))
+    for capture, found in defaults().items():
+        ours = (cell(mean(found, f"{kind}_bytes"), mean(found, f"{kind}_psnr")) for kind in ("packed", "tuned"))
         rows.append([capture, *(stock.get(capture, {}).get(kind, "") for kind in FORMATS), *ours])
     kinds = list(FORMATS.values())
     return table(["capture", f"splatfacto, {kinds[0]}", *kinds[1:], "sundae", "fine-tuned"], rows, words=1)
 
 
-def _stock(cell: Callable[[dict[str, float]], Any]) -> dict[str, dict[str, Any]]:
+def stock_in(cell: Callable[[dict[str, float]], Any]) -> dict[str, dict[str, Any]]:
     """A cell of stock splatfacto for each format, by capture, from means over the seeds."""
     groups: dict[str, dict[str, list[dict[str, Any]]]] = {}
     for line in sorted(lines_of("formats.csv"), key=lambda line: str(line["capture"])):
@@ -189,8 +166,7 @@ def _stock(cell: Callable[[dict[str, float]], Any]) -> dict[str, dict[str, Any]]
             groups.setdefault(line["capture"], {}).setdefault(line["format"] + theirs, []).append(line)
     return {
         capture: {
-            kind: cell({name: _mean(lines, name) for name in ("bytes", "psnr", "ssim")})
-            for kind, lines in found.items()
+            kind: cell({name: mean(lines, name) for name in ("bytes", "psnr", "ssim")}) for kind, lines in found.items()
         }
         for capture, found in groups.items()
     }
@@ -211,7 +187,7 @@ def equal_quality() -> list[str]:
         if line.get("variant") == "sundae-fast" and line["finetune_steps"]:
             cells = {"bytes": line["bytes"], "psnr": line["psnr_packed"], "ssim": line["ssim_packed"]}
             packs[line["run"]].append({**cells, "fixed": False})
-    theirs = {capture: kinds[".sog theirs"] for capture, kinds in _stock(dict).items() if ".sog theirs" in kinds}
+    theirs = {capture: kinds[".sog theirs"] for capture, kinds in stock_in(dict).items() if ".sog theirs" in kinds}
     rows = []
     for name in ("psnr", "ssim"):
         shares = [_least_bytes(packs[capture], name, sog[name]) / sog["bytes"] for capture, sog in theirs.items()]
@@ -298,6 +274,12 @@ def stability() -> list[str]:
     return [one + other[1:] for one, other in zip_longest(left, right, fillvalue=blank)]
 
 
+def others() -> list[str]:
+    """What others reach: measured beside us, and published."""
+    rows = lines_of("others.csv")
+    return table(list(rows[0]), [list(row.values()) for row in rows])
+
+
 GLUE = "\0"
 """Stands for a space at which no line ends."""
 
@@ -343,7 +325,7 @@ def _first(value: Any) -> str:
 
 MAKERS = (quality, speed, training_time, packing, formats, packed_headline, equal_quality, multi_gpu, prune)
 TABLES: dict[str, Callable[[], list[str]]] = {
-    make.__name__.replace("_", "-"): make for make in (*MAKERS, sizes_asked, stability, library)
+    make.__name__.replace("_", "-"): make for make in (*MAKERS, sizes_asked, others, stability, library)
 }
 
 

@@ -23,7 +23,6 @@ from sundae_ns.cli.process import run_logged
 from sundae_ns.cli.refusals import check_folder
 from sundae_ns.core.errors import ConfigError, StorageError, SundaeError, writing
 from sundae_ns.core.files import write_text
-from sundae_ns.core.tables import table
 
 STOPPED = 130
 """Exit code after an interrupt, as in shells."""
@@ -64,8 +63,6 @@ class Options:
     """factor on all lengths, for a trial."""
     shard: str = "1/1"
     """i/n runs the i-th of n parts."""
-    jobs: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """only list the jobs, and which are done."""
 
     def command(self) -> str:
         """The command of the whole comparison, without the shard."""
@@ -73,7 +70,7 @@ class Options:
         for option in fields(self):
             value = getattr(self, option.name)
             values = value if isinstance(value, tuple) else () if value is True else (value,)
-            if value not in ((), False) and option.name not in ("folder", "out", "shard", "jobs"):
+            if value not in ((), False) and option.name not in ("folder", "out", "shard"):
                 words += [f"--{option.name.replace('_', '-')}", *map(str, values)]
         return shlex.join(words)
 
@@ -92,14 +89,11 @@ def check_out(out: Path, *, reads: Iterable[Path]) -> None:
 def compare(
     plan: Sequence[Job], options: Options, page: Page, runner: Runner | None, console: Console, *, whole: bool = False
 ) -> int:
-    """List the jobs, or run them and write the tables; the exit code, 1 if a job failed.
+    """Run the jobs and write the tables; the exit code, 1 if a job failed.
 
     ``whole`` captures are left out once their first job has failed.
     """
     out, jobs = options.out, jobs_of_shard(plan, options.shard)
-    if options.jobs:
-        show_jobs(jobs, out, console)
-        return 0
     try:
         failed = run_jobs(jobs, out, runner or spawn, console, whole=whole)
     except KeyboardInterrupt:
@@ -112,15 +106,6 @@ def compare(
     if failed:
         console.print(f"{len(failed)} jobs failed; the same command runs them again", highlight=False)
     return 1 if failed else 0
-
-
-def show_jobs(jobs: Sequence[Job], out: Path, console: Console) -> None:
-    """List jobs, and mark finished ones."""
-    done = _finished(out)
-    rows = [[job.key, job.method, f"{job.steps:,}", job.needs or "", "done" if job.key in done else ""] for job in jobs]
-    for line in table(["job", "method", "steps", "needs", ""], rows):
-        console.print(line, highlight=False, soft_wrap=True)
-    console.print(f"{len(jobs)} jobs, {sum(job.key in done for job in jobs)} done", highlight=False)
 
 
 def run_jobs(

@@ -20,7 +20,6 @@ ELSEWHERE = {
     "run walk.mp4": "the same of a video; cli/test_run.py reads its commands, data/test_reconstruct.py makes captures",
     "poses ": "takes minutes; data/test_reconstruct.py finds the poses of a still life",
     "train CAPTURE": "becomes ns-train, in place of this process; cli/test_train.py reads its command",
-    "python benchmarks/quality.py": "trains a dozen runs; test_benchmarks.py runs it with two short ones",
     "python benchmarks/suite.py": "trains every method on every capture; test_benchmarks.py trains one method",
     "view scene.sundae": "serves until Ctrl-C; cli/test_view.py serves a page, and opens and ends it",
     "ns-train sundae --machine.num-devices 2": "needs two GPUs; plugin/test_whole_runs.py trains on two",
@@ -127,7 +126,7 @@ def test_commands_on_runs_run(call_here, monkeypatch):
     # The viewer never ends; test_viewer.py renders in it.
     monkeypatch.setattr("nerfstudio.scripts.viewer.run_viewer._start_viewer", lambda *run: shown.append(run[2]))
     commands = [words for page in PAGES for kind in ("ns-eval ", "ns-viewer ") for words in commands_of(page, kind)]
-    assert len(commands) > 3
+    assert len(commands) > 1
     for words in commands:
         Path("eval.json").unlink(missing_ok=True)
         call_here(*words)
