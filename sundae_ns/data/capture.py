@@ -136,13 +136,12 @@ def _must(holds: Callable[[Any], object], requirement: str) -> Callable[[Any, st
     return check
 
 
-def _numbers(value: Any) -> bool:
-    numbers = isinstance(value, list) and all(type(number) in (int, float) for number in value)
-    return numbers and len(value) in (4, 6, 12) and all(abs(number) <= _LARGEST for number in value)
-
-
 _path = _must(lambda value: isinstance(value, str) and value and "\0" not in value, "the path of a file")
 _angle = _must(lambda value: type(value) in (int, float) and 0 < value < math.pi, "an angle in radians, below pi")
+_numbers = _must(
+    lambda value: isinstance(value, list) and all(type(n) in (int, float) and abs(n) <= _LARGEST for n in value),
+    "a list of 4, 6 or 12 finite numbers",
+)
 _radius = _must(
     lambda value: isinstance(value, float) and 0 < value < math.inf, "a positive number of pixels with a decimal point"
 )
@@ -153,7 +152,7 @@ _CHECKS: dict[str, Callable[[Any, str, str], Any]] = {
     **dict.fromkeys(("cx", "cy", *DISTORTION), finite),
     **dict.fromkeys(("camera_angle_x", "camera_angle_y"), _angle),
     **dict.fromkeys(("mask_path", "depth_file_path", "ply_file_path"), _path),
-    "distortion_params": _must(_numbers, "a list of 4, 6 or 12 finite numbers"),
+    "distortion_params": _numbers,
     "camera_model": lambda value, _, where: kind_of_model(value, where),
     "transform_matrix": lambda value, name, where: rigid(matrix(value, (4,), name, where), where),
     "applied_transform": lambda value, name, where: matrix(value, (3,), name, where),

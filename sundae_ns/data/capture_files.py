@@ -199,11 +199,9 @@ def _intrinsics(camera: Any) -> dict[str, float]:
 
 def _pose(camera_from_world: np.ndarray) -> np.ndarray:
     """Camera-to-world ``[4, 4]`` with OpenGL axes, in the capture's coordinates, of COLMAP's pose ``[3, 4]``."""
-    rotation, translation = camera_from_world[:, :3], camera_from_world[:, 3]
-    pose = np.eye(4)
-    pose[:3, :3] = APPLIED[:, :3] @ rotation.T * np.array(OPENGL_TO_OPENCV)
-    pose[:3, 3] = APPLIED[:, :3] @ (-rotation.T @ translation)
-    return pose
+    bottom = [0.0, 0.0, 0.0, 1.0]
+    pose = np.linalg.inv([*camera_from_world, bottom]) * (*OPENGL_TO_OPENCV, 1.0)
+    return np.array([*(APPLIED[:, :3] @ pose[:3]), bottom])
 
 
 def write_demo_capture(out: Path) -> Path:

@@ -5,6 +5,7 @@ Colours of a high dynamic range (Rec. ITU-R BT.2100) or a wide gamut go by the n
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cache, lru_cache
@@ -26,16 +27,13 @@ REPAIR = "repair it or remove the view"
 # Pillow's types of pixels that are read, and those in which their colours are converted.
 _MODES = {"CMYK": "CMYK", **dict.fromkeys(("1", "L", "LA", "I;16", "I;16B", "I;16L"), "L")}
 _MODES |= dict.fromkeys(("P", "PA", "RGB", "RGBA", "YCbCr"), "RGB")
-PQ, HLG, ADOBE = 16, 18, -1  # transfers; Adobe RGB (1998) has no number
+PQ, HLG = 16, 18  # transfers
 HIGH_RANGE = (PQ, HLG)
-BT709, BT2020, P3 = 1, 9, 12
-# Chromaticities of red, green and blue; white is D65.
-_PRIMARIES = {
-    BT709: ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06)),
-    BT2020: ((0.708, 0.292), (0.170, 0.797), (0.131, 0.046)),
-    P3: ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060)),
-    ADOBE: ((0.64, 0.33), (0.21, 0.71), (0.15, 0.06)),
-}
+# Chromaticities of red, green and blue, here of BT.709 and sRGB; white is D65.
+_SRGB = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06)
+# Those of BT.2020 and Display P3.
+_PRIMARIES = {9: (0.708, 0.292, 0.170, 0.797, 0.131, 0.046), 12: (0.680, 0.320, 0.265, 0.690, 0.150, 0.060)}
+_ADOBE = 563 / 256, (0.64, 0.33, 0.21, 0.71, 0.15, 0.06)  # Adobe RGB (1998), an exponent and primaries
 _WHITE = 203.0  # cd/m2, of a white sheet (Report ITU-R BT.2408); HLG is for a display of 1,000
 _KNEE = 0.46  # share of white from which a high range is rolled off
 
@@ -56,21 +54,26 @@ def check_image(path: Path, *, mask: bool = False) -> tuple[int, int]:
 
 
 def opened(path: Path) -> Image.Image:
-    """An image whose header is read."""
+    """An image whose header is read; that of a PNG with ``info["cicp"]``, which Pillow passes over."""
     if path.suffix.lower() in HEIF:
         reads_heif()
-    return Image.open(regular(path))
+    image: Image.Image = Image.open(regular(path))
+    if image.format == "PNG":
+        image.close()
+        content = path.read_bytes()  # of a file, Pillow asks for as many bytes as a chunk states
+        image, end = Image.open(BytesIO(content)), max(content.find(b"IDAT"), 0)
+        if (at := content.find(b"\0\0\0\4cICP", 0, end)) >= 0:
+            image.info["cicp"] = content[at + 8 : at + 12]
+    return image
 
 
 @cache
 def reads_heif() -> bool:
     """Whether pillow-heif is installed; then Pillow reads HEIC from now on."""
-    try:
-        from pillow_heif import register_heif_opener
-    except ImportError:
-        return False
-    register_heif_opener()
-    return True
+    with suppress(ImportError):
+        importlib.import_module("pillow_heif").register_heif_opener()
+        return True
+    return False
 
 
 def decoded(path: Path) -> Image.Image:
@@ -92,13 +95,11 @@ def to_srgb(image: Image.Image) -> Image.Image:
     convert, deep = _conversion(image), image.mode.startswith("I;16")
     alpha = image.convert("RGBA").getchannel("A") if image.has_transparency_data else None
     base = Image.fromarray(np.round(np.asarray(image) / 257).astype(np.uint8)) if deep else image
-    base = base.convert(_MODES[image.mode])
-    base = base if convert is None else convert(base)
-    if base.mode == "CMYK" or alpha is not None:
-        base = base.convert("RGB")
+    base = (convert or (lambda same: same))(base.convert(_MODES[image.mode]))
     if alpha is not None:
+        base = base.convert("RGB")
         base.putalpha(alpha)
-    return base
+    return base.convert("RGB") if base.mode == "CMYK" else base
 
 
 def is_srgb(image: Image.Image) -> bool:
@@ -108,21 +109,31 @@ def is_srgb(image: Image.Image) -> bool:
 
 
 def _conversion(image: Image.Image) -> Callable[[Image.Image], Any] | None:
-    """A function to sRGB, by an ICC profile, or by HEIF's numbers or Adobe RGB in EXIF data; None for those of sRGB."""
-    if (profile := image.info.get("icc_profile")) is not None:
+    """A function to sRGB, by what an image states, in the order of the PNG specification; None for those of sRGB."""
+    cicp = image.info.get("cicp")
+    if cicp is None and (profile := image.info.get("icc_profile")) is not None:
         transform = _transform(profile, _MODES[image.mode])
         return transform and (lambda base: ImageCms.applyTransform(base.convert(transform.input_mode), transform))
-    stated = 0, 0
+    stated: tuple[float, Any] = 0, 0
     with suppress(Exception):  # a damaged entry is none
-        if "nclx_profile" in image.info:
+        if cicp is not None:
+            stated = cicp[1], cicp[0]
+        elif image.format == "PNG" and "srgb" not in image.info:
+            gamma, xy = image.info.get("gamma", 1 / 2.2), tuple(image.info.get("chromaticity", (0, 0, *_SRGB))[2:])
+            if np.abs(np.subtract((gamma, *xy), (1 / 2.2, *_SRGB))).max() > 0.005:
+                _to_xyz(xy)  # raises for those of no colour space
+                stated = 1 / gamma, xy
+        elif "nclx_profile" in image.info:
             nclx = image.info["nclx_profile"]
             stated = int(nclx["transfer_characteristics"]), int(nclx["color_primaries"])
         elif image.format in ("JPEG", "MPO", "TIFF"):
             adobe = image.getexif().get_ifd(ExifTags.IFD.Interop).get(1) == "R03"
-            stated = (ADOBE, ADOBE) if adobe else stated
-    if stated[0] not in HIGH_RANGE and stated[1] not in (P3, ADOBE):
+            stated = _ADOBE if adobe else stated
+    narrow = cicp is not None and cicp[3:] == b"\0"
+    if stated[0] not in _LIGHT and stated[1] not in _PRIMARIES and not isinstance(stated[0], float) and not narrow:
         return None
-    return lambda base: Image.fromarray(to_srgb_values(np.asarray(base.convert("RGB")), *stated))
+    levels = [round((code - 16) * 255 / 219) if narrow else code for code in range(256)] * 3
+    return lambda base: Image.fromarray(to_srgb_values(np.asarray(base.convert("RGB").point(levels)), *stated))
 
 
 @lru_cache(maxsize=16)
@@ -141,15 +152,21 @@ def _transform(profile: bytes, mode: str) -> Any:
     return transform if change > 1 and (source == mode or (mode, source) == ("L", "RGB")) else None
 
 
-def to_srgb_values(values: NDArray[np.uint8] | NDArray[np.uint16], transfer: int, primaries: int) -> NDArray[np.uint8]:
-    """sRGB ``[H, W, 3]`` of code values. Unknown primaries count as BT.2020 in a high range, else as those of sRGB."""
+def to_srgb_values(values: NDArray[Any], transfer: float, primaries: Any) -> NDArray[np.uint8]:
+    """sRGB ``[H, W, 3]`` of code values, by a number and a number, or by an exponent (float) and chromaticities.
+
+    Unknown primaries count as BT.2020 in a high range, else as those of sRGB.
+    """
     codes = np.linspace(0, 1, np.iinfo(values.dtype).max + 1)
-    light = _LIGHT.get(transfer, _srgb)(codes).astype(np.float32)[values]
-    known = primaries if primaries in _PRIMARIES else BT2020 if transfer in HIGH_RANGE else BT709
+    light = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
+    light = codes**transfer if isinstance(transfer, float) else _LIGHT[transfer](codes) if transfer in _LIGHT else light
+    light = light.astype(np.float32)[values]
+    if not isinstance(primaries, tuple):
+        primaries = _PRIMARIES.get(primaries, _PRIMARIES[9] if transfer in HIGH_RANGE else _SRGB)
     if transfer == HLG:
         luminance = light @ np.array([0.2627, 0.6780, 0.0593], np.float32)
         light *= 1000 / _WHITE * luminance[..., None] ** np.float32(0.2)
-    light = light @ _to_709(known)
+    light = light @ np.linalg.solve(_to_xyz(_SRGB), _to_xyz(primaries)).T.astype(np.float32)
     if transfer in HIGH_RANGE:
         brightest = light.max(axis=-1, keepdims=True).clip(1e-6)
         rolled = 1 - (1 - _KNEE) * np.exp((_KNEE - brightest) / (1 - _KNEE))
@@ -159,18 +176,10 @@ def to_srgb_values(values: NDArray[np.uint8] | NDArray[np.uint16], transfer: int
     return np.round(255 * code).astype(np.uint8)
 
 
-def _to_709(primaries: int) -> NDArray[np.float32]:
-    """Matrix ``[3, 3]`` from the light of these primaries to that of BT.709, for rows."""
-    white = np.array([0.3127, 0.3290, 0.3583]) / 0.3290
-    to_xyz = []
-    for key in (primaries, BT709):
-        columns = np.array([(x, y, 1 - x - y) for x, y in _PRIMARIES[key]]).T
-        to_xyz.append(columns * np.linalg.solve(columns, white))
-    return np.linalg.solve(to_xyz[1], to_xyz[0]).T.astype(np.float32)
-
-
-def _srgb(code: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+def _to_xyz(xy: tuple[float, ...]) -> NDArray[np.float64]:
+    """Matrix ``[3, 3]`` from light of these primaries, whose white is D65, to CIE XYZ."""
+    columns = np.array([xy[::2], xy[1::2], [1 - x - y for x, y in zip(xy[::2], xy[1::2], strict=True)]], np.float64)
+    return columns * np.linalg.solve(columns, np.array([0.3127, 0.3290, 0.3583]) / 0.3290)
 
 
 def _pq(code: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -178,12 +187,11 @@ def _pq(code: NDArray[np.float64]) -> NDArray[np.float64]:
     return 10000 / _WHITE * ((power - 0.8359375).clip(0) / (18.8515625 - 18.6875 * power)) ** (8192 / 1305)
 
 
-def _hlg(code: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Light of the scene."""
-    return np.where(code <= 0.5, code**2 / 3, (np.exp((code - 0.55991073) / 0.17883277) + 0.28466892) / 12)
-
-
-_LIGHT = {PQ: _pq, HLG: _hlg, ADOBE: lambda code: code ** (563 / 256)}
+# Light of code values; that of HLG is of the scene.
+_LIGHT: dict[float, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
+    **{4: lambda code: code**2.2, 5: lambda code: code**2.8, 8: lambda code: code, PQ: _pq},
+    HLG: lambda code: np.where(code <= 0.5, code**2 / 3, (np.exp((code - 0.55991073) / 0.17883277) + 0.28466892) / 12),
+}
 
 
 def exif_orientation(path: Path) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -46,11 +47,9 @@ def models_in(data: Path) -> dict[str, int]:
     """Number of images of each COLMAP model in the usual places of a folder, the largest first; 0 if damaged."""
     counts: dict[str, int] = {}
     for folder in _model_folders(data):
-        try:
-            count = len(read_images(folder))
-        except DataError:
-            count = 0
-        counts[folder.relative_to(data).as_posix()] = count
+        counts[name := folder.relative_to(data).as_posix()] = 0
+        with suppress(DataError):
+            counts[name] = len(read_images(folder))
     return dict(sorted(counts.items(), key=lambda item: -item[1]))
 
 

@@ -60,10 +60,11 @@ def kind_of_model(model: Any, where: str) -> str:
     raise _refusal(str(model), where, f"camera_model is {model!r:.80}; use one of {', '.join(_KINDS)}")
 
 
-def _refusal(model: str, where: str, otherwise: str) -> DataError:
+def _refusal(model: str, where: str, otherwise: str = "") -> DataError:
     """The error for a projection, with a remedy of its own if there is one."""
     remedy = next((remedy for start, remedy in _REMEDIES.items() if model.startswith(start)), None)
     what = f"camera model {model} is no lens that perspective images can be made of; {remedy}"
+    otherwise = otherwise or f"nerfstudio does not support camera model {model}; {_UNDISTORT}"
     return DataError(f"{where}: {what if remedy else otherwise}")
 
 
@@ -98,13 +99,9 @@ def colmap_lens(model: str, params: Sequence[float], where: str) -> tuple[tuple[
     _, kind, names, zeros = COLMAP_LENSES[model]
     stated = dict(zip(names.split(), map(float, params), strict=True))
     if kind is None or any(stated[name] for name in zeros.split()):
-        raise _unsupported(model, where)
+        raise _refusal(model, where)
     fx, fy = stated.get("fx", stated.get("f", 0.0)), stated.get("fy", stated.get("f", 0.0))
     return (fx, fy, stated["cx"], stated["cy"]), Lens(kind, tuple(stated.get(key, 0.0) for key in DISTORTION))
-
-
-def _unsupported(model: str, where: str) -> DataError:
-    return _refusal(model, where, f"nerfstudio does not support camera model {model}; {_UNDISTORT}")
 
 
 def colmap_model(model: int | str, where: str) -> str:
@@ -112,7 +109,7 @@ def colmap_model(model: int | str, where: str) -> str:
     for name, (number, kind, _, _) in COLMAP_LENSES.items():
         if model in (name, number):
             if kind is None:
-                raise _unsupported(name, where)
+                raise _refusal(name, where)
             return name
     raise DataError(f"{where}: camera model {model} is not known here; calibrate the capture with OPENCV")
 

@@ -43,7 +43,6 @@ def find_photos(folder: Path, warn: Callable[[str], object] = str) -> list[Photo
 
     Hidden files and folders and those of masks are left out, and photos that cannot be read, with a line to ``warn``.
     """
-    paths: list[Path] = []
     with reading(folder, "a folder of photos"):
         paths = sorted(path for path in _files(folder) if path.suffix.lower() in SUFFIXES)
     counts = Counter(path.parent for path in paths)

@@ -1,11 +1,15 @@
 """Images decoded to sRGB, against Pillow's ImageCms: profiles, types of pixels, colours that are stated otherwise."""
 
+import struct
+import zlib
+
 import numpy as np
 import pytest
 from icc_profiles import SPACES, judged, profile
+from limits import verdict
 from PIL import Image, ImageCms
 
-from sundae_ns.data.images import decoded, opened, reads_heif, to_srgb
+from sundae_ns.data.images import decoded, opened, reads_heif, to_srgb, to_srgb_values
 from sundae_ns.data.photos import photo_of, upright
 
 
@@ -70,6 +74,52 @@ def test_colours_of_heic_without_a_profile(tmp_path, transfer, primaries, change
         assert off(converted, judged(patches(), "P3")) <= 10
 
 
+SAME = np.asarray(patches(), int)
+P3, ADOBE = (68000, 32000, 26500, 69000, 15000, 6000), (64000, 33000, 21000, 71000, 15000, 6000)
+WIDE = {"gAMA": [100000], "cHRM": [31270, 32900, *P3]}
+CODES, NARROW = SAME / 255, (SAME - 16.0).clip(0, 219) * 255 / 219
+LINEAR = 255 * np.where(CODES <= 0.0031308, 12.92 * CODES, 1.055 * CODES ** (1 / 2.4) - 0.055)
+ICC = {"iCCP": b"a\0\0" + zlib.compress(profile("Adobe RGB"))}
+HDR = to_srgb_values(np.asarray(patches()), 16, 9).astype(int)
+CHUNKS = {
+    "P3": ({"cICP": bytes((12, 13, 0, 1))}, "P3", 10),  # sRGB's own curve, of which that of the profile is off by 8
+    "cICP first": ({"cICP": bytes((1, 13, 0, 1)), **ICC, **WIDE}, None, 0),
+    "a profile before gAMA": (ICC | WIDE, "Adobe RGB", 3),
+    "sRGB before gAMA": ({"sRGB": b"\0", **WIDE}, None, 0),
+    "gAMA and cHRM": ({"gAMA": [45470], "cHRM": [31270, 32900, *ADOBE]}, "Adobe RGB", 3),
+    "gAMA and cHRM of P3": (WIDE | {"gAMA": [45455]}, "P3", 3),
+    "those of sRGB": ({"gAMA": [45455], "cHRM": [31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000]}, None, 0),
+    "linear": ({"gAMA": [100000]}, LINEAR, 1),
+    "linear by cICP": ({"cICP": bytes((1, 8, 0, 1))}, LINEAR, 1),
+    "PQ": ({"cICP": bytes((9, 16, 0, 1))}, HDR, 0),
+    "no primaries": ({"cHRM": [0] * 8}, None, 0),
+    "a gamma of zero": ({"gAMA": [0]}, None, 0),
+    "a short cICP": ({"cICP": b"\14"}, None, 0),
+    "limited range": ({"cICP": bytes((1, 13, 0, 0))}, NARROW, 1),
+}
+
+
+@pytest.mark.parametrize(("chunks", "expected", "most"), CHUNKS.values(), ids=CHUNKS)
+def test_colours_of_a_png_by_its_chunks(tmp_path, chunks, expected, most):
+    patches().save(tmp_path / "a.png")
+    content, head = (tmp_path / "a.png").read_bytes(), b""
+    for name, data in chunks.items():
+        data = data if isinstance(data, bytes) else struct.pack(f">{len(data)}I", *data)
+        body = name.encode() + data
+        head += struct.pack(">I", len(data)) + body + struct.pack(">I", zlib.crc32(body))
+    (tmp_path / "a.png").write_bytes(content[:33] + head + content[33:])
+    expected = judged(patches(), expected) if isinstance(expected, str) else expected
+    assert photo_of(tmp_path / "a.png").as_it_is == (expected is None)
+    assert off(decoded(tmp_path / "a.png"), SAME if expected is None else expected) <= most
+
+
+def test_a_png_is_read_in_little_memory_whatever_its_chunks_state(tmp_path):
+    patches().save(path := tmp_path / "a.png")
+    content = path.read_bytes()
+    path.write_bytes(content.replace(content[33:37], b"\x7f\xff\xff\xff", 1))  # of the pixels
+    assert verdict(lambda: decoded(path), len(content)) is None
+
+
 def test_adobe_rgb_by_exif(tmp_path):
     """Cameras state Adobe RGB by DCF's R03 alone; the photo that is saved states it no more."""
     exif = Image.Exif()
@@ -93,7 +143,7 @@ def with_profile(mode, space):
     return lambda path: patches().convert(mode).save(path, icc_profile=icc)
 
 
-SAME, GREY = np.asarray(patches(), int), np.asarray(patches().convert("L").convert("RGB"), int)
+GREY = np.asarray(patches().convert("L").convert("RGB"), int)
 TYPES = {
     "16 bits": (grey16, "L", GREY),
     "a palette": (lambda path: patches().quantize(64).save(path), "RGB", SAME),

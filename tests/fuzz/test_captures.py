@@ -39,17 +39,25 @@ def as_text(data):
 
 
 FILES = [f"sparse/0/{name}.{kind}" for name in ("cameras", "images", "points3D") for kind in ("bin", "txt")]
-FILES += ["transforms.json", "0.png", "0.jpg"]
+FILES += ["transforms.json", "0.png", "0.jpg", "masks/half.png"]
 many = settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+
+
+@pytest.fixture(scope="module")
+def warm(scene):
+    """Load a capture once without limits: the first threads of a process reserve addresses that it keeps."""
+    load(scene)
 
 
 @pytest.mark.parametrize("file", FILES)
 @many
 @given(change=damage())
-def test_damaged_files(capture, file, change):
+def test_damaged_files(warm, capture, file, change):
     path = capture / file
     if path.suffix == ".txt" and not path.exists():
         as_text(capture)
+    elif file.startswith("masks") and not path.exists():
+        _masked(capture)
     elif file.startswith("0") and not path.exists():
         old = meta_of(capture)["frames"][0]["file_path"]
         with Image.open(capture / old) as image:
@@ -58,8 +66,10 @@ def test_damaged_files(capture, file, change):
         (capture / "transforms.json").write_text(text)
     content = path.read_bytes()
     path.write_bytes(change(content))
-    verdict(lambda: load(capture, colmap=file.startswith("sparse")), bytes_of(capture))
-    path.write_bytes(content)
+    try:
+        verdict(lambda: load(capture, colmap=file.startswith("sparse")), bytes_of(capture))
+    finally:  # for the next case, and for hypothesis to see the same again
+        path.write_bytes(content)
 
 
 VALUES = (
@@ -115,7 +125,7 @@ REFUSED = {
     "a round lens of a whole number": ({**ROUND, "fisheye_crop_radius": 7}, "with a decimal point"),
     "a round lens and masks": ({**ROUND, "fisheye_crop_radius": 7.0, "frames": masked(FIRST)}, "remove mask_path"),
     "distortion NaN": ({"k1": NAN}, "k1 is nan"),
-    "distortion of 3 numbers": ({"distortion_params": [0, 0, 0]}, "4, 6 or 12"),
+    "distortion of 3 numbers": ({"distortion_params": [0, 0, 0]}, "needs distortion_params of 6 numbers"),
     "a split of other images": ({"frames/1/file_path": "images/none.png"}, "which no frame has as file_path"),
     "a missing split": ({"train_filenames": ["a.png"], "val_filenames": None}, "train_filenames|val_filenames"),
     "no list of test images": ({"val_filenames": GONE, "test_filenames": GONE}, "none for val"),
