@@ -50,7 +50,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "pruning": (("pruning/[!_]*.py",), ("pruning/test_*.py", "train/test_schedules.py")),
     "schedules": (
         ("train/pruning.py", "train/choice.py"),
-        ("train/test_schedules.py", "train/test_choice.py", "train/test_golden_trials.py"),
+        ("train/test_pruning.py", "train/test_schedules.py", "train/test_choice.py", "train/test_golden_trials.py"),
     ),
     "surgery": (("core/surgery.py", "core/merging.py"), ("core/test_*.py",)),
     "packing": (("io/pack/[!_]*.py",), ("io/pack/test_*.py", "fuzz/test_readers.py")),
