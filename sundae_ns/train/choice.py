@@ -90,27 +90,27 @@ def least_gain(doublings: float) -> float:
     return max(LEAST_GAIN, GAIN_PER_DOUBLING * doublings)
 
 
-def is_enough(psnr: float, ssim: float, doublings: float) -> bool:
-    """Whether gains in PSNR (dB) and SSIM pay for doublings of the bytes; those that are not finite do not."""
-    return math.inf > psnr >= least_gain(doublings) and ssim >= 0
+def is_enough(gained: float, least: float, doublings: float) -> bool:
+    """Whether a gain (dB) pays for doublings of the bytes and the least of all gains is no loss; not if not finite."""
+    return math.inf > gained >= least_gain(doublings) and least >= 0
 
 
 def best_head(tried: Sequence[Tried], folds: int) -> str:
-    """The largest head that gains enough over the best smaller one and loses no SSIM.
+    """The largest head that gains enough over the best smaller one, by PSNR and SSIM in the mean, and loses neither.
 
     ``tried`` has a row for each head and fold, heads in their order; a head whose folds have not all ended is left out.
     """
-    best: list[Tried] = []
+    best: Tried | None = None
     for first in range(0, len(tried) - folds + 1, folds):
-        rows = list(tried[first : first + folds])
-        if best:
-            views = [[view for row in candidate for view in row.qualities] for candidate in (best, rows)]
-            (psnr, ssim), (better, closer) = map(mean_quality, views)
-            doublings = math.log2(sum(rows[0].bytes or [1]) / sum(best[0].bytes or [1]))
-            if not is_enough(better - psnr, closer - ssim, doublings):
+        rows = tried[first : first + folds]
+        row = replace(rows[0], views=[view for each in rows for view in each.views])
+        if best is not None:
+            gain, doublings = HeadGain.of(best, row), math.log2(sum(row.bytes or [1]) / sum(best.bytes or [1]))
+            gained = gain.psnr if gain.ssim_db is None else (gain.psnr + gain.ssim_db) / 2
+            if not is_enough(gained, min(gain.psnr, gain.ssim), doublings):
                 continue
-        best = rows
-    return best[0].head if best else "plain"
+        best = row
+    return best.head if best else "plain"
 
 
 class HeadGain(NamedTuple):
