@@ -1,8 +1,10 @@
 """How nerfstudio finds the methods: entry points, help, configurations, and an import path that is light."""
 
+import re
 import subprocess
 import sys
 from importlib.metadata import entry_points
+from pathlib import Path
 
 import pytest
 import yaml
@@ -57,6 +59,9 @@ def test_configuration(name):
     groups = {"means", "scales", "quats", "features_dc", "features_rest", "opacities", "features", "compensation"}
     assert groups <= set(config.optimizers)
     assert yaml.load(yaml.dump(config), Loader=yaml.Loader) == config
+    promised = (Path(__file__).parents[2] / "docs" / "formats.md").read_text().partition("## What is promised")[2]
+    names = re.findall(r"sundae_ns\.[\w.]*\.(\w+)", yaml.dump(config))
+    assert [name for name in names if f"{name}`" not in promised and f"{name[:-6]}`" not in promised] == []
 
 
 def test_methods_share_no_objects():
