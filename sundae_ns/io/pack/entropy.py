@@ -21,8 +21,7 @@ CONTEXTS = 4
 NEIGHBOURS = 4  # earlier rows from which the contexts of a row are made
 WINDOW = 128  # earlier rows among which they are searched
 _MASK = 0xFFFFFFFF
-_NODES = 128
-_SIDE = 64
+_NODES = 144  # no power of two: contexts would share the sets of a cache
 _LAST = 24
 _CLASSES = 16
 _EVEN = 1 << 15
@@ -105,10 +104,10 @@ def _number(coder, stream, chances, kinds, first, value, reading):  # type: igno
         return 0, coder
     bit = -1 if reading else (1 if value < 0 else 0)
     negative, coder = _decided(coder, stream, chances, kinds, first + 1, 1, bit)
-    size, side = abs(value), _SIDE * negative
+    size = abs(value)
     digits = 0
     while digits < _LAST - 1:
-        node = side + min(2 + digits, 17)
+        node = 2 * min(1 + digits, 16) + negative
         bit = -1 if reading else (1 if size >> (digits + 1) > 0 else 0)
         bit, coder = _decided(coder, stream, chances, kinds, first + node, node, bit)
         if bit == 0:
@@ -118,7 +117,7 @@ def _number(coder, stream, chances, kinds, first, value, reading):  # type: igno
     for k in range(digits):
         bit = -1 if reading else (size >> (digits - 1 - k)) & 1
         if k < 2 and digits < 15:
-            node = side + 18 + 3 * digits + (k + (found & 1) if k else 0)
+            node = 2 * (17 + 3 * digits + (k + (found & 1) if k else 0)) + negative
             bit, coder = _decided(coder, stream, chances, kinds, first + node, node, bit)
         else:
             bit, coder = _coded(coder, stream, _EVEN, bit)
