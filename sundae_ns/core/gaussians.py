@@ -116,9 +116,10 @@ class Gaussians(UserDict[str, Any]):
         """SH degree of the stored colours."""
         return sh_degree(self["features_rest"])
 
-    def rows(self, mask: Tensor) -> Gaussians:
-        """The Gaussians under a mask, bool ``[N]``, in a new mapping."""
-        return Gaussians({name: value[mask] for name, value in self.items()}, self.encoding)
+    def rows(self, index: Tensor) -> Gaussians:
+        """The Gaussians under a mask, bool ``[N]``, or of indices ``[M]``, in a new mapping."""
+        places = torch.arange(self.num_gaussians, device=self["means"].device)[index]  # a mask is searched once
+        return Gaussians({name: value.index_select(0, places) for name, value in self.items()}, self.encoding)
 
     def replaced(self, values: Mapping[str, Tensor]) -> Gaussians:
         """The same tensors except for these values, in a new mapping that surgery does not change."""
@@ -202,7 +203,6 @@ def sanitise(params: Mapping[str, Any]) -> Sanitised:
     gaussians = as_gaussians(params)
     values: dict[str, Tensor] = {}
     opacities, scales, quats = (gaussians[name].detach() for name in ("opacities", "scales", "quats"))
-    n = gaussians.num_gaussians
     infinite, narrow = opacities.isinf(), scales.isneginf()
     limits, flat = infinite.flatten(1).any(dim=1), narrow.any(dim=1)
     unrotated = torch.zeros_like(flat)
@@ -211,7 +211,7 @@ def sanitise(params: Mapping[str, Any]) -> Sanitised:
     if bool(flat.any()):
         narrowest = torch.where(scales.isfinite(), scales, LEAST_SCALES[1]).amin().clamp(*LEAST_SCALES)
         values["scales"] = torch.where(narrow, narrowest, scales)
-    if n:
+    if gaussians.num_gaussians:
         largest = quats.abs().amax(dim=1)
         odd = ((largest < 1e-6) | (largest > 1e18)) & largest.isfinite()
         if bool(odd.any()):
