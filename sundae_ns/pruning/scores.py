@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -84,22 +85,21 @@ def pixel_detail(image: Tensor, cells: float) -> Tensor:
     side = round((height * width / max(cells, 1.0)) ** 0.5)
     # An odd window of at least 3 pixels.
     half = max(1, min(side, height, width) // 2)
-    values = image.detach().nan_to_num().double()
-    values = values - values[0, 0]  # a flat image has sums of exactly 0
-    values = torch.cat([values, values.square().sum(dim=2, keepdim=True)], dim=2)
+    values = image.detach().nan_to_num().double().permute(2, 0, 1).contiguous()
+    values = values - values[:, :1, :1]  # a flat image has sums of exactly 0
+    values = torch.cat([values, values.square().sum(dim=0, keepdim=True)])
     if values.device.type == "cpu":
         import cv2  # takes a tenth of a second, also in commands that prune nothing
 
-        # By running sums. Those of another channel, of ones, count the pixels of a window within the image.
-        counted = torch.cat([values, torch.ones_like(values[..., :1])], dim=2).numpy()
-        sums = cv2.boxFilter(counted, -1, (2 * half + 1,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        values = torch.from_numpy(sums[..., :-1] / sums[..., -1:])
+        # By running sums, plane by plane; those of ones count the pixels of a window within the image.
+        summed = partial(cv2.boxFilter, ddepth=-1, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        planes = (*values, torch.ones_like(values[0]))
+        *sums, counts = (torch.from_numpy(summed(plane.numpy(), ksize=(2 * half + 1,) * 2)) for plane in planes)
+        values = torch.stack(sums) / counts
     else:
         for y, x in ((half, 0), (0, half)):  # columns, then rows
-            planes = values.permute(2, 0, 1)
-            planes = avg_pool2d(planes, (2 * y + 1, 2 * x + 1), 1, (y, x), count_include_pad=False)
-            values = planes.permute(1, 2, 0)
-    variance = (values[..., -1] - values[..., :-1].square().sum(dim=2)).clamp_min(0)
+            values = avg_pool2d(values, (2 * y + 1, 2 * x + 1), 1, (y, x), count_include_pad=False)
+    variance = (values[-1] - values[:-1].square().sum(dim=0)).clamp_min(0)
     mean = variance.mean()
     if not mean > 0:
         return torch.ones_like(variance).to(image.dtype)
