@@ -19,13 +19,13 @@ from nerfstudio.data.datamanagers import full_images_datamanager
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
-from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.data.datasets.base_dataset import InputDataset, get_image_mask_tensor_from_path
 from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
 from sundae_ns.core.errors import ConfigError, DataError, SundaeError, one_line, reading
-from sundae_ns.data.images import TURNED, check_image, decoded, exif_orientation, turned, wrong_size
+from sundae_ns.data.images import TURNED, check_image, decoded, exif_orientation, opened, turned, wrong_size
 from sundae_ns.data.layouts import larger_model, unused_masks
 from sundae_ns.plugin.dataparsers import check_cameras, check_capture, check_ranges, check_tests, rebound, set_parser
 from sundae_ns.train.progress import warn
@@ -93,7 +93,9 @@ class CheckedDataset(InputDataset):
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
         """Image, and mask if the capture has masks; ``DataError`` if a file of this view is damaged."""
         with reading(self.image_filenames[image_idx], "an image that can be decoded", remedy="repair or remove it"):
-            return super().get_data(image_idx, image_type)
+            mask = rebound(get_image_mask_tensor_from_path, Image=SimpleNamespace(**{**vars(Image), "open": opened}))
+            read = rebound(InputDataset.get_data, get_image_mask_tensor_from_path=mask)
+            return cast(dict[str, Any], read(self, image_idx, image_type))
 
 
 class NoTestViews:
@@ -184,7 +186,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         """Test set."""
         dataset = super().create_eval_dataset()
         if len(dataset) > (sys.argv[1:2] == ["interpolate"]):  # ns-render needs two for a path between them
-            check_tests(self.train_dataparser_outputs.cameras, dataset.cameras, dataset.image_filenames)
+            check_tests(self.train_dataparser_outputs, dataset)
         else:
             dataset.cameras = cast(Any, NoTestViews(self.config.capture))
         return dataset

@@ -358,17 +358,16 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
     kinds = cameras.camera_type.flatten()
     unknown = ~torch.isin(kinds, torch.tensor(list(TYPES.values()), dtype=kinds.dtype))
     if unknown.any():
-        i = _first(unknown)
-        what = f"{names[i].name} is of type {CameraType(int(kinds[i])).name}, which no perspective image can be made of"
+        what = f"{names[unknown.tolist().index(True)].name} is of type {CameraType(int(kinds[unknown][0])).name}"
         raise DataError(f"the camera of {what}; cut its images into perspective ones, such as cube faces")
     mirrored = torch.linalg.det(cameras.camera_to_worlds[:, :, :3]) < 0
     if mirrored.any():
-        which = f"{names[_first(mirrored)].name} mirrors an axis ({int(mirrored.sum())} of {len(names)} poses do)"
+        which = f"{names[mirrored.tolist().index(True)].name} mirrors an axis ({mirrored.sum()} of {len(names)} do)"
         raise DataError(f"the pose of {which}; negate one column of its rotation")
     ratios = (cameras.fx / cameras.width.clamp_min(1)).flatten()
     strange = (ratios < 0.01) | (ratios > 1000)  # views of 178 and of 0.06 degrees
     if strange.any():
-        i = _first(strange)
+        i = strange.tolist().index(True)
         size = f"{float(cameras.fx[i]):.3g} px and the image is {int(cameras.width[i])} px wide"
         raise DataError(f"the focal length of {names[i].name} is {size}, which no lens has; give it in pixels")
     if points is not None:
@@ -385,23 +384,22 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
     if not far.any() and usual > 0 and (far := distances > 20 * usual).any() and len(cloud):
         far &= distances > STRAY * float((cloud.double() - middle).norm(dim=1).median())
     if far.any():
-        times = f"{float(distances[_first(far)] / usual):,.0f} times as far away as most"
-        which = f"{names[_first(far)].name} is {times if usual > 0 else 'far from all others'}"
+        times = f"{float(distances[far.tolist().index(True)] / usual):,.0f} times as far away as most"
+        which = f"{names[far.tolist().index(True)].name} is {times if usual > 0 else 'far from all others'}"
         warn(f"the camera of {which} ({int(far.sum())} of {len(names)} are); check its pose, or remove the view")
 
 
-def check_tests(train: Cameras, test: Cameras, names: Sequence[Path]) -> None:
-    """Warn of test cameras ``[M]``, of images ``names``, that stand far from all others."""
-    centres = torch.cat([train.camera_to_worlds[:, :, 3], test.camera_to_worlds[:, :, 3]]).double().cpu()
-    far = torch.from_numpy(stray_cameras(centres.numpy()))[len(train) :]
+def check_tests(train: Any, test: Any) -> None:
+    """Warn of cameras and images of a test set that stand far from all others, or are those of a training set."""
+    names: Sequence[Path] = test.image_filenames
+    if shared := {*train.image_filenames} & {*names}:
+        which = f"{min(shared).name} is a training image and a test view ({len(shared)} of {len(names)} test views are)"
+        warn(f"{which}, so figures are better than those of new views; list each image once, in one split")
+    centres = torch.cat([data.cameras.camera_to_worlds[:, :, 3] for data in (train, test)]).double().cpu()
+    far = torch.from_numpy(stray_cameras(centres.numpy()))[-len(names) :]
     if far.any():
-        which = f"{names[_first(far)].name}, a test view, stands far from all others"
+        which = f"{names[far.tolist().index(True)].name}, a test view, stands far from all others"
         warn(f"the camera of {which} ({int(far.sum())} of {len(names)} do); check its pose, or remove the view")
-
-
-def _first(flags: Tensor) -> int:
-    """Index of the first True."""
-    return int(flags.nonzero()[0])
 
 
 def check_projection(camera: Cameras) -> None:

@@ -163,7 +163,7 @@ NAMES = [Path(f"{index}.png") for index in range(6)]
 @pytest.mark.parametrize(
     ("options", "cause"),
     [
-        ({"kind": CameraType.VR180_L}, r"camera of 0\.png is of type VR180_L, .*such as cube faces"),
+        ({"kind": CameraType.VR180_L}, r"camera of 0\.png is of type VR180_L; .*such as cube faces"),
         ({"mirrored": True}, r"pose of 4\.png mirrors an axis \(1 of 6"),
         ({"focal": 1e-5}, r"focal length of 0\.png is 1e-05 px and the image is 20 px wide"),
         ({"focal": 1e9}, r"no lens has; give it in pixels"),

@@ -123,6 +123,13 @@ def test_a_stray_camera_does_not_shrink_the_scene(capture, load, edit, capsys, t
     assert float(found[name][:, 3].norm()) > 0.5 * times
 
 
+def test_a_test_view_that_is_trained_on_is_named(capture, load, edit, capsys):
+    name = meta_of(capture)["train_filenames"][0]
+    edit(capture, val_filenames=[name], test_filenames=[name])
+    load(capture)
+    assert f"{Path(name).name} is a training image and a test view (1 of 1 test views are)" in said(capsys)
+
+
 def test_a_stray_test_view_is_named(capture, load, edit, capsys):
     name = stray(capture, 100.0, edit, index=3)
     made = load(capture)
