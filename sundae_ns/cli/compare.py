@@ -29,7 +29,7 @@ from sundae_ns.train.curve import read_count_curve
 
 
 def compare(
-    scenes: Annotated[list[Path], tyro.conf.Positional],
+    scenes: Annotated[list[Path], tyro.conf.Positional, tyro.conf.arg(metavar="PATH ...", help_behavior_hint="")],
     out: Annotated[File, tyro.conf.arg(aliases=["-o"])] = None,
     data: File = None,
     cameras: File = None,

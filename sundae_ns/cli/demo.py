@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from sundae_ns.cli.options import Int, Overwrite, Source
+from sundae_ns.cli.options import Input, Int, Overwrite
 from sundae_ns.cli.refusals import check_folder, check_least
 from sundae_ns.cli.run import Project, carry_out
 from sundae_ns.cli.train import TrainOptions
@@ -13,7 +13,7 @@ from sundae_ns.core.errors import writing
 from sundae_ns.data.capture_files import write_demo_capture
 
 
-def demo(out: Source = Path(".demo"), steps: Int = None, overwrite: Overwrite = False) -> int:
+def demo(out: Input = Path(".demo"), steps: Int = None, overwrite: Overwrite = False) -> int:
     """Write the embedded capture, train it with ns-train, pack it, compare it with its photos, and write its page.
 
     Args:

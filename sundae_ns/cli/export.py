@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import tyro
 from rich.console import Console
@@ -32,9 +33,9 @@ class ExportDetails(SceneDetails):
 def export(
     scene: Scene,
     out: Out,
-    beside: tyro.conf.Positional[File] = None,
+    beside: Annotated[tyro.conf.Positional[File], tyro.conf.arg(metavar="[BESIDE]")] = None,
     wishes: Plain[Wishes] = Wishes(),  # noqa: B008
-    views: tuple[str, ...] = (),
+    views: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=LINK ...", help_behavior_hint="")] = (),
     lod: Flag = False,
     advanced: Advanced[ExportDetails] = ExportDetails(),  # noqa: B008
 ) -> int:
@@ -47,7 +48,7 @@ def export(
         out: file to write; its suffix selects the format: .html, .ply or .glb (exact), .spz or .sog (quantised,
             much smaller). A name without a suffix is a folder of page and scene, for a web server.
         beside: another scene, which the page shows as it is beside the first one, by the same camera.
-        views: views that the page names: NAME=LINK, each with a link that its button Copy link gives.
+        views: views that the page names, each with a link that its button Copy link gives.
         lod: write levels of detail as streamed SOG (lod-meta.json) into the folder, for PlayCanvas's viewers. Below
             the full scene are a half, a quarter and a tenth of its Gaussians, each pruned from it and trained on its
             images; minutes on a GPU.

@@ -32,8 +32,8 @@ def info(scene: Scene, cameras: File = None, json: Flag = False) -> int:
     facts |= {"crop": f"--crop {_words(facts['crop'])} holds 99% of what they see"}
     for name, value in facts.items():
         parts = value if isinstance(value, dict) else {}
-        print(f"{name.replace('_', ' '):20}{'' if parts else _words(value)}".rstrip())
-        print("".join(f"  {part:18}{size:,}\n" for part, size in parts.items()), end="")
+        print(f"{name.replace('_', ' '):22}{'' if parts else _words(value)}".rstrip())
+        print("".join(f"  {part:20}{size:,}\n" for part, size in parts.items()), end="")
     return 0
 
 

@@ -9,6 +9,7 @@ from contextlib import redirect_stdout
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import torch
@@ -19,6 +20,7 @@ from sundae_ns.cli.options import SceneDetails, Wishes
 from sundae_ns.cli.refusals import check_file
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import ConfigError, DataError, SundaeError
+from sundae_ns.core.files import write_bytes
 from sundae_ns.core.tables import MEGABYTE
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.io.config_file import check_run, config_of, find_config
@@ -48,6 +50,7 @@ class Edit(NamedTuple):
     cameras: Sequence[Camera]  # those given or stored; of a pruned scene, those that decided
     form: Form = Form()  # of a file of a given size
     pruned: PrunedScene | None = None
+    file: bytes | None = None  # what a search for a size has written
 
     @property
     def stated(self) -> Scene:
@@ -58,14 +61,15 @@ class Edit(NamedTuple):
         """Whether a .ply keeps the rows, properties and comments of another one."""
         return kind_of(self.source) == "ply" and out.suffix.lower() == ".ply" and has_own_columns(self.source)
 
-    def write(self, out: Path) -> int:
-        """Write the scene; a .ply of a .ply keeps its properties and comments. Returns the bytes."""
-        if self.copies_rows(out):
+    def write(self, out: Path) -> None:
+        """Write the scene; a .ply of a .ply keeps its properties and comments."""
+        if self.file is not None:
+            write_bytes(out, self.file)
+        elif self.copies_rows(out):
             moved = self.pruned is not None and self.pruned.moved
             keep_vertices(self.source, out, self.rows, self.stated.gaussians if moved else None)
         else:
             save(self.stated, out, config=self.form.precision)
-        return out.stat().st_size
 
     def cut(self, mask: Tensor) -> Edit:
         """With the Gaussians of a mask."""
@@ -117,7 +121,7 @@ class Edit(NamedTuple):
             if rule.uses_contribution or wishes.max_mb is not None or target_drop is not None:
                 cameras = cameras or virtual_cameras(scene, num_cameras, seed=rule.seed)
             if target_drop is not None:
-                count, curve = count_for_drop(scene, target_drop, cameras, rule, progress=True)
+                count, curve = count_for_drop(scene, target_drop, cameras, rule)
                 for number, psnr in curve:
                     print(f"{number:12,} Gaussians: {psnr:.2f} dB against the full scene, on held-out cameras")
 
@@ -130,11 +134,14 @@ class Edit(NamedTuple):
             # All columns of a .ply stay.
             forms = Form.choices(scene, out.suffix.lower())[: 1 if self.copies_rows(out) or not rounds else None]
 
-            def write(pruned: PrunedScene, form: Form, folder: Path) -> int:
-                return after(pruned, form).write(folder / out.name)
+            def file_of(pruned: PrunedScene, form: Form) -> bytes:
+                after(pruned, form).write(Path(folder, out.name))
+                return Path(folder, out.name).read_bytes()
 
             most = int(wishes.max_mb * MEGABYTE)
-            return after(*prune_to_bytes(scene, most, write, forms, cameras, rule, progress=True))
+            with TemporaryDirectory() as folder:
+                pruned, form, file = prune_to_bytes(scene, most, file_of, forms, cameras, rule)
+            return after(pruned, form)._replace(file=file)
 
     def shown(self) -> tuple[str, Scene, bytes]:
         """Name, scene and packed file of what a page shows; a packed scene stays as it is."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -11,17 +12,25 @@ from typing import Annotated, Any, TypeVar
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from tyro.constructors import PrimitiveConstructorSpec
 
 from sundae_ns.cli.refusals import check_exclusive, check_least
 from sundae_ns.core.errors import ConfigError
-from sundae_ns.core.share import Share
+from sundae_ns.core.share import SHARE
 
 T = TypeVar("T")
-# Options that may be left out: their help names the type, not None beside it.
-Int = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")]
-Float = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")]
+NO_DEFAULT = tyro.conf.arg(help_behavior_hint="")  # in the help
+
+
+def _optional(read: Callable[[str], float], metavar: str) -> PrimitiveConstructorSpec[Any]:
+    """How a number that may be left out is read: errors and help of a union would name None beside it."""
+    return PrimitiveConstructorSpec(1, metavar, lambda words: read(words[0]), lambda _: True, lambda x: [str(x)])
+
+
+Int = Annotated[int | None, _optional(lambda word: int(word.replace(",", "")), "INT"), NO_DEFAULT]
+Float = Annotated[float | None, _optional(float, "FLOAT"), NO_DEFAULT]
 File = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
-Source = Annotated[Path, tyro.conf.Positional]  # the file or the folder that a command reads
+Input = Annotated[Path, tyro.conf.Positional]  # the file or the folder that a command reads
 _SCENES = (
     "a packed scene or its page (.html), a run (its folder or config.yml), or a .ply, .spz, .sog, lod-meta.json, .glb, "
     ".splat, .ksplat or gsplat's .pt."
@@ -37,7 +46,7 @@ Box = tuple[float, float, float, float, float, float]
 class Wishes:
     """What a scene is to be, in every command: in turn a box, no floaters, and a number of Gaussians or a size."""
 
-    keep: Annotated[Share | None, tyro.conf.arg(metavar="SHARE", help_behavior_hint="")] = None
+    keep: Annotated[float | None, SHARE, NO_DEFAULT] = None
     """share of the Gaussians to keep, 0.25 or 25%."""
     count: Int = None
     """number of Gaussians to keep, in place of a share."""

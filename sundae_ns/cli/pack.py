@@ -12,18 +12,7 @@ from json import dumps
 from typing import TYPE_CHECKING, Any
 
 from sundae_ns.cli.inputs import opened
-from sundae_ns.cli.options import (
-    Advanced,
-    Flag,
-    Float,
-    Out,
-    Plain,
-    SceneDetails,
-    Source,
-    Wishes,
-    progress_bar,
-    words_of,
-)
+from sundae_ns.cli.options import Advanced, Flag, Float, Input, Out, Plain, SceneDetails, Wishes, progress_bar, words_of
 from sundae_ns.cli.refusals import check_exclusive, check_file, check_least
 from sundae_ns.core.errors import ConfigError, SundaeError
 from sundae_ns.core.tables import MEGABYTE, without_nan
@@ -54,7 +43,7 @@ class PackDetails(SceneDetails):
 
 
 def pack(
-    run: Source,
+    run: Input,
     out: Out,
     wishes: Plain[Wishes] = Wishes(),  # noqa: B008
     advanced: Advanced[PackDetails] = PackDetails(),  # noqa: B008

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 from sundae_ns.cli.main import STEP
-from sundae_ns.cli.options import File, Out, Plain, Source, progress_bar, word
+from sundae_ns.cli.options import File, Input, Out, Plain, progress_bar, word
 from sundae_ns.cli.refusals import check_folder, check_least
 from sundae_ns.core.errors import ConfigError, DataError, SundaeError, one_line
 from sundae_ns.data.capture_files import Placed
@@ -36,7 +36,7 @@ class PoseOptions:
     beside the photos."""
 
 
-def poses(photos: Source, out: Out, options: Plain[PoseOptions] = PoseOptions()) -> int:  # noqa: B008
+def poses(photos: Input, out: Out, options: Plain[PoseOptions] = PoseOptions()) -> int:  # noqa: B008
     """Find the camera poses of photos, and write a capture: images at several sizes, transforms.json, points, masks.
 
     The same command again continues an interrupted one. All processors are used, or as many as OMP_NUM_THREADS says.

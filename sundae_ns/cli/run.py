@@ -13,7 +13,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from sundae_ns.cli.options import Hidden, Out, Plain, Source, word, words_of
+from sundae_ns.cli.options import Hidden, Input, Out, Plain, word, words_of
 from sundae_ns.cli.poses import PoseOptions, check_poses
 from sundae_ns.cli.process import run_command
 from sundae_ns.cli.refusals import check_folder
@@ -45,7 +45,7 @@ class Step(NamedTuple):
 class Project:
     """The options of ``sundae run``, and the files and steps that follow from them."""
 
-    photos: Source  # folder of photos, a video, or a capture, which has poses already
+    photos: Input  # folder of photos, a video, or a capture, which has poses already
     out: Out  # folder for the capture, the run, scene.sundae, scene.html and the report; created if missing
     quality: Literal["draft", "normal", "best"] = "normal"
     """draft trains 3,000 steps; best loses less to a smaller size (pruning.max-drop 0.03)."""

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import tyro
 
-from sundae_ns.cli.options import Advanced, Details, File, Flag, Int, Out, Plain, Source, Wishes, word, words_of
+from sundae_ns.cli.options import Advanced, Details, File, Flag, Input, Int, Out, Plain, Wishes, word, words_of
 from sundae_ns.cli.process import run_command
 from sundae_ns.cli.refusals import check_folder, check_least
 from sundae_ns.core.errors import STOPPED, ConfigError, DataError
@@ -85,7 +85,7 @@ def methods() -> list[str]:
 
 
 def train(
-    capture: Source,
+    capture: Input,
     further: Annotated[tuple[str, ...], tyro.conf.Positional] = (),
     out: Out = Path("outputs"),
     resume: Flag = False,

@@ -11,5 +11,5 @@ def _share(words: list[str]) -> float:
     return float(words[0].removesuffix("%")) / (100 if words[0].endswith("%") else 1)
 
 
-_SPEC = PrimitiveConstructorSpec(1, "SHARE", _share, lambda value: isinstance(value, float), lambda value: [str(value)])
-Share = Annotated[float, _SPEC]  # 0.25 or 25%
+SHARE = PrimitiveConstructorSpec(1, "SHARE", _share, lambda x: isinstance(x, float | None), lambda x: [str(x)])
+Share = Annotated[float, SHARE]  # 0.25 or 25%

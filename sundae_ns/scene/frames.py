@@ -211,13 +211,8 @@ class FrameReplay:
 
 
 def _recordable(source: GaussianSource, settings: RenderSettings) -> bool:
-    return (
-        settings.backend.name == "gsplat"
-        and source.replayable
-        and not settings.training
-        and not torch.is_grad_enabled()
-        and source.gaussians.num_gaussians > 0
-    )
+    still = not settings.training and not torch.is_grad_enabled()
+    return settings.backend.name == "gsplat" and source.replayable and still and source.gaussians.num_gaussians > 0
 
 
 def _record(

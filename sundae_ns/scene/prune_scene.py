@@ -12,8 +12,6 @@ import math
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache, partial
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -105,11 +103,10 @@ def prune_with_mask(
     fit: bool = True,
     weights: Tensor | None = None,
     graph: NeighborGraph | None = None,
-    images: Sequence[Tensor] = (),
 ) -> PrunedScene:
-    """As :func:`prune`, with the mask of the kept Gaussians; without ``fit``, a training that follows fits them.
+    """As :func:`prune`, with the mask of the kept Gaussians; without ``fit``, what follows fits them.
 
-    ``weights``, ``images`` (:func:`weights_in`) and ``graph`` of the finite Gaussians, if given, are not made anew.
+    ``weights`` (:func:`weights_in`) and ``graph`` of the finite Gaussians, if given, are not made anew.
     """
     if (keep is None) == (count is None):
         raise ConfigError("prune needs either keep (a share) or count (a number of Gaussians); give one of them")
@@ -118,25 +115,28 @@ def prune_with_mask(
     rule, sanitised = rule or PruneRule(), sanitise(scene.gaussians)
     n = sanitised.gaussians.num_gaussians
     count = whole(count, "count") if keep is None else kept_count(keep, n)
-    usable = dataclasses.replace(scene, gaussians=sanitised.gaussians)
-    console = Console(stderr=True) if progress else None
+    usable, given = dataclasses.replace(scene, gaussians=sanitised.gaussians), cameras or ()
+    console, images = Console(stderr=True) if progress else None, list[Tensor]()
     if not rule.uses_contribution or count >= n:
         weights = None
-    else:
+    elif weights is None:
         given = cameras if cameras is not None else scene.cameras or virtual_cameras(usable)
-        if weights is None:
-            images = list[Tensor]()
-            weights = weights_in(usable, given, count if rule.uses_detail else None, console, images if fit else None)
-    pruned = prune_gaussians(sanitised.gaussians, rule, count, weights, graph)
-    small = dataclasses.replace(scene, gaussians=pruned.gaussians)
-    if weights is not None and rule.refits and fit:
-        full, scaled, size = of_unit_size(usable, given)
-        settings, unit = scene.settings(head=False), resized(pruned.gaussians, 1 / size)
-        fitted = refit(unit, full.gaussians, scaled, settings, images=images, seed=rule.seed, console=console)
-        small = dataclasses.replace(scene, gaussians=resized(fitted, size))
-    mask = within(sanitised.mask, pruned.decision.mask)
+        weights = weights_in(usable, given, count if rule.uses_detail else None, console, images if fit else None)
+    cut = prune_gaussians(sanitised.gaussians, rule, count, weights, graph)
+    small, mask = dataclasses.replace(scene, gaussians=cut.gaussians), within(sanitised.mask, cut.decision.mask)
     seen = None if weights is None else float((weights > 0).float().mean())
-    return PrunedScene(small, mask, seen, rule.redistribution == "merge" and count < n)
+    pruned = PrunedScene(small, mask, seen, rule.redistribution == "merge" and count < n)
+    return fitted(pruned, usable, given, rule, images=images, console=console) if fit else pruned
+
+
+def fitted(pruned: PrunedScene, full: Scene, cameras: Sequence[Camera], rule: PruneRule, **options: Any) -> PrunedScene:
+    """What is kept of a finite scene, fitted by :func:`refit` with its ``options`` if the rule and the cameras do."""
+    if pruned.seen is None or not rule.refits:
+        return pruned
+    unit, scaled, size = of_unit_size(full, cameras)
+    small, settings = resized(pruned.scene.gaussians, 1 / size), full.settings(head=False)
+    small = refit(small, unit.gaussians, scaled, settings, seed=rule.seed, **options)
+    return pruned._replace(scene=dataclasses.replace(pruned.scene, gaussians=resized(small, size)))
 
 
 def at_most(camera: Camera, pixels: int) -> Camera:
@@ -235,7 +235,7 @@ def _blended(gaussians: Gaussians, cameras: Sequence[Camera], settings: RenderSe
 
 
 def count_for_drop(
-    scene: Scene, drop: float, cameras: Sequence[Camera], rule: PruneRule, *, progress: bool = False
+    scene: Scene, drop: float, cameras: Sequence[Camera], rule: PruneRule
 ) -> tuple[int, list[tuple[int, float]]]:
     """The fewest Gaussians whose images lose at most ``drop`` dB, with the PSNR (dB) by counts that it follows from.
 
@@ -250,7 +250,7 @@ def count_for_drop(
     n, before = sanitise(scene.gaussians).gaussians.num_gaussians, 0.0
     curve: list[tuple[int, float]] = []
     while n > 16:
-        pruned = prune_with_mask(scene, None, n // 2, trained, rule, progress=progress).scene
+        pruned = prune_with_mask(scene, None, n // 2, trained, rule, progress=True).scene
         psnr = measure(pruned, scene, held_out, head=False).psnr
         curve.append((n // 2, psnr))
         error = 10 ** (-psnr / 10)
@@ -291,82 +291,85 @@ class Form(NamedTuple):
 def prune_to_bytes(
     scene: Scene,
     most: int,
-    write: Callable[[PrunedScene, Form, Path], int],
+    write: Callable[[PrunedScene, Form], bytes],
     forms: Sequence[Form],
     cameras: Sequence[Camera],
     rule: PruneRule,
-    *,
-    progress: bool = False,
-) -> tuple[PrunedScene, Form]:
-    """The scene and the form of a file of 97 to 100% of ``most`` bytes; of fewer if that is all.
+) -> tuple[PrunedScene, Form, bytes]:
+    """The scene, the form and the content of a file of 97 to 100% of ``most`` bytes; of fewer if that is all.
 
-    The scene is finite; ``write`` puts a file into a folder, and returns its bytes. Every eighth of the ``cameras``
-    compares the forms. ``progress`` shows bars and remarks on stderr. ``ConfigError`` if hardly a Gaussian fits.
+    The scene is finite; ``write`` makes the content. Every eighth of the ``cameras`` compares the forms. Bars and
+    remarks go to stderr. ``ConfigError`` if hardly a Gaussian fits.
     """
-    n, packs = scene.num_gaussians, len({form.power for form in forms}) > 1
-    order = torch.randperm(n, generator=torch.Generator().manual_seed(0)).to(scene.device)
-    with TemporaryDirectory() as folder:
+    n, packs, file_of = scene.num_gaussians, len({form.power for form in forms}) > 1, cache(write)
 
-        @cache
-        def bytes_of(pruned: PrunedScene, form: Form) -> int:
-            return write(pruned, form, Path(folder))
+    def bytes_of(pruned: PrunedScene, form: Form) -> int:
+        return len(file_of(pruned, form))
 
-        def rounded(pruned: PrunedScene, form: Form) -> Form:
-            return largest(lambda power: form._replace(power=power), partial(bytes_of, pruned), most, form.power)
-
-        def rows(count: int) -> PrunedScene:
-            mask = torch.zeros(n, dtype=torch.bool, device=scene.device).index_fill_(0, order[:count], True)
-            return PrunedScene(scene[mask], mask)
-
-        def sampled(form: Form) -> tuple[float, float]:
-            """Bytes of no Gaussian, and of each."""
-            few, many = (min(n, count) for count in SAMPLED)
-            first, second = bytes_of(rows(few), form), bytes_of(rows(many), form)
-            each = (second - first) / (many - few) if many > few else first / n
-            return first - few * each, each
-
-        lines = [sampled(form) for form in forms]
-        # Sparser Gaussians take more bytes each, so the whole scene takes at most about this.
-        if lines[0][0] + n * lines[0][1] <= most and bytes_of(whole := rows(n), forms[0]) <= most:
-            form = rounded(whole, forms[0]) if packs else forms[0]
-            if (size := bytes_of(whole, form)) < LEAST * most and progress:
-                print(f"the whole scene takes {size / MEGABYTE:.2f} MB, less than was asked for", file=sys.stderr)
-            return whole, form
-        counts = [min(n, int((AIM * most - fixed) / each)) for fixed, each in lines]
-        possible = [i for i, count in enumerate(counts) if count > 0]
-        if not possible:
-            raise ConfigError(f"a file without Gaussians has {lines[-1][0]:,.0f} bytes; give more than {most:,}")
-        graph = gaussian_graph(scene.gaussians, rule) if rule.uses_graph and n > 1 else None
-        weights, images = None, list[Tensor]()
-        if rule.uses_contribution:
-            console = Console(stderr=True) if progress else None
-            middle = max(sorted(counts)[len(counts) // 2], 1)
-            weights = weights_in(scene, cameras, middle if rule.uses_detail else None, console, images)
-
-        @cache
-        def cut(count: int, fit: bool = False) -> PrunedScene:
-            known: dict[str, Any] = {"weights": weights, "graph": graph, "images": images}
-            return prune_with_mask(scene, None, count, cameras, rule, progress=progress, fit=fit, **known)
-
-        best, psnr = possible[0], -math.inf
-        if len(possible) > 1:
-            judges = [at_most(camera, PIXELS) for camera in (split(cameras)[1] or list(cameras))[:JUDGES]]
-            truths, as_read = [render(scene, camera).rgb for camera in judges], _as_packed if packs else Form.of
-            for i in possible:  # less and less exact, until more Gaussians do not make up for it
-                if (found := measure(as_read(forms[i], cut(counts[i]).scene), truths, judges).psnr) <= psnr:
-                    break
-                best, psnr = i, found
-        form, pruned = forms[best], cut(counts[best], fit=packs)
+    def rounded(pruned: PrunedScene, form: Form) -> tuple[PrunedScene, Form, bytes]:
         if packs:
-            return pruned, rounded(pruned, form)
+            form = largest(lambda power: form._replace(power=power), partial(bytes_of, pruned), most, form.power)
+        return pruned, form, file_of(pruned, form)
 
-        def fewer(fit: bool, power: float) -> PrunedScene:
-            return cut(max(round(n / 2**power), 1), fit)
+    whole_scene = PrunedScene(scene, torch.ones(n, dtype=torch.bool, device=scene.device))
+    lines = [_bytes_by_count(scene, partial(bytes_of, form=form)) for form in forms]
+    # Sparser Gaussians take more bytes each, so the whole scene takes at most about this.
+    if lines[0][0] + n * lines[0][1] <= most and bytes_of(whole_scene, forms[0]) <= most:
+        left = rounded(whole_scene, forms[0])
+        if len(left[2]) < LEAST * most:
+            print(f"the whole scene takes {len(left[2]) / MEGABYTE:.2f} MB, less than was asked for", file=sys.stderr)
+        return left
+    counts = [min(n, int((AIM * most - fixed) / each)) for fixed, each in lines]
+    possible = [(form, count) for form, count in zip(forms, counts, strict=True) if count > 0]
+    if not possible:
+        raise ConfigError(f"a file without Gaussians has {lines[-1][0]:,.0f} bytes; give more than {most:,}")
+    console, images = Console(stderr=True), list[Tensor]()
+    graph = gaussian_graph(scene.gaussians, rule) if rule.uses_graph and n > 1 else None
+    middle = max(sorted(counts)[len(counts) // 2], 1) if rule.uses_detail else None
+    weights = weights_in(scene, cameras, middle, console, images) if rule.uses_contribution else None
 
-        for fit in (False, True):  # a fit hardly changes the bytes, so it begins with a count that fits without
-            halvings, powers = math.log2(n / len(pruned.scene)), (0.0, math.log2(n))
-            pruned = largest(partial(fewer, fit), partial(bytes_of, form=form), most, halvings, powers, 1.0)
-    return pruned, form
+    @cache
+    def cut(count: int) -> PrunedScene:
+        return prune_with_mask(scene, None, count, cameras, rule, fit=False, weights=weights, graph=graph)
+
+    candidates = ((form, cut(count)) for form, count in possible)
+    form, pruned = next(candidates) if len(possible) == 1 else _nearest_form(scene, candidates, cameras, packs)
+    fit = cache(partial(fitted, full=scene, cameras=cameras, rule=rule, images=images, console=console))
+
+    def sized(change: Callable[[PrunedScene], PrunedScene], near: PrunedScene) -> PrunedScene:
+        """What has as many Gaussians as fit, changed before it is written; the search begins ``near`` it."""
+        halvings, powers = math.log2(n / len(near.scene)), (0.0, math.log2(n))
+        at, size = lambda power: change(cut(max(round(n / 2**power), 1))), partial(bytes_of, form=form)
+        return largest(at, size, most, halvings, powers, 1.0)
+
+    if packs:
+        return rounded(fit(pruned), form)
+    # A fit hardly changes the bytes, so its search begins with a count that fits without.
+    pruned = sized(fit, sized(lambda pruned: pruned, pruned))
+    return pruned, form, file_of(pruned, form)
+
+
+def _bytes_by_count(scene: Scene, bytes_of: Callable[[PrunedScene], int]) -> tuple[float, float]:
+    """Bytes of a file of no Gaussian, and of each one, by two files of random ones."""
+    places = torch.randperm(scene.num_gaussians, generator=torch.Generator().manual_seed(0)).argsort().to(scene.device)
+    few, many = (places < count for count in SAMPLED)
+    first, second = (bytes_of(PrunedScene(scene[mask], mask)) for mask in (few, many))
+    each = (second - first) / max(int(many.sum() - few.sum()), 1) or first / len(scene)
+    return first - int(few.sum()) * each, each
+
+
+def _nearest_form(
+    scene: Scene, candidates: Iterable[tuple[Form, PrunedScene]], cameras: Sequence[Camera], packs: bool
+) -> tuple[Form, PrunedScene]:
+    """Of less and less exact forms with more and more Gaussians, that whose images are nearest to the scene's."""
+    judges = [at_most(camera, PIXELS) for camera in (split(cameras)[1] or list(cameras))[:JUDGES]]
+    truths, as_read = [render(scene, camera).rgb for camera in judges], _as_packed if packs else Form.of
+    psnr = -math.inf
+    for form, pruned in candidates:
+        if (found := measure(as_read(form, pruned.scene), truths, judges).psnr) <= psnr:
+            break  # more Gaussians no longer make up for it
+        best, psnr = (form, pruned), found
+    return best
 
 
 def _as_packed(form: Form, scene: Scene) -> Scene:

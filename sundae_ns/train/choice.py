@@ -213,10 +213,8 @@ def with_head(curve: Sequence[CurvePoint], gain: HeadGain) -> list[CurvePoint]:
     """The curve of a field with a head, from one without."""
     points = []
     for point in curve:
-        psnr, ssim = (
-            factor * gained * gain.falls_by(point.count, power)
-            for gained, (factor, power) in ((gain.psnr, HEAD_PSNR), (gain.ssim, HEAD_SSIM))
-        )
+        psnr = HEAD_PSNR[0] * gain.psnr * gain.falls_by(point.count, HEAD_PSNR[1])
+        ssim = HEAD_SSIM[0] * gain.ssim * gain.falls_by(point.count, HEAD_SSIM[1])
         added = gain.bytes_of(point.count)
         size = None if point.bytes is None or added is None else point.bytes + added
         point = replace(point, bytes=size, psnr=point.psnr + psnr, ssim=point.ssim + ssim)

@@ -377,12 +377,13 @@ def test_the_panel_of_a_phone(site):
         assert page.evaluate("[panel.scrollHeight <= panel.clientHeight, document.body.scrollWidth]") == [True, 390]
 
 
-def test_two_scenes_named_views_and_a_path(folder, tmp_path):
+@pytest.mark.parametrize("flags", [browser.WEBGPU, WEBGL])
+def test_two_scenes_named_views_and_a_path(flags, folder, tmp_path):
     """Without heads nothing is missing, so WebGL2 says nothing."""
     whole = dataclasses.replace(packed_file(folder / "a.sundae")[0], head=None)
     away = whole.cameras[0]._replace(viewmat=whole.cameras[0].viewmat + 0.1 * torch.eye(4)[[3, 3, 3, 3]])
     page_of_scene({"whole": whole, "half": whole[::2]}, tmp_path / "a.html", views={"Far": away, "<b>Two": 1})
-    with opened((tmp_path / "a.html").as_uri(), flags=WEBGL, size=(640, 480)) as page:
+    with opened((tmp_path / "a.html").as_uri(), flags=flags, size=(640, 480)) as page:
         assert page.evaluate("[sundae.message, document.title, message.hidden]") == ["", "whole | half", True]
         assert page.evaluate("sundae.count") == [len(whole), len(whole[::2])]
         assert page.evaluate("[...document.querySelectorAll('.name')].map((e) => e.textContent)") == ["whole", "half"]
