@@ -67,14 +67,14 @@ def __getattr__(name: str) -> Any:
     if first:
         gc.disable()
     try:
-        usual_defaults = importlib.import_module("sundae_ns.core.values").usual_defaults
-        with usual_defaults():
+        values = importlib.import_module("sundae_ns.core.values")
+        with values.usual_defaults():
             value = getattr(importlib.import_module(_HOMES[name]), name)
     finally:
         if first:
             gc.freeze()
             gc.enable()
-    globals()[name] = value = usual_defaults()(value) if isinstance(value, FunctionType) else value
+    globals()[name] = value = values.fitting()(value) if isinstance(value, FunctionType) else value
     return value
 
 

@@ -33,8 +33,7 @@ SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
 Encoding = Literal["harmonics", "logits"]
 """``harmonics``: ``features_dc`` and ``features_rest`` are coefficients of spherical harmonics. ``logits``:
 ``features_dc`` holds logits of view-independent colours, as splatfacto does at SH degree 0."""
-SPLAT_NAMES = ("means", "scales", "quats", "features_dc", "features_rest", "opacities")
-"""Parameters of every 3DGS scene, named as in splatfacto's checkpoints."""
+SPLAT_NAMES = ("means", "scales", "quats", "features_dc", "features_rest", "opacities")  # named as in splatfacto
 _COLUMNS = {"means": 3, "scales": 3, "quats": 4, "features_dc": 3, "opacities": 1}
 MAX_SH_DEGREE = 4
 FEATURES = "features"  # name of the parameter that SUNDAE adds to each Gaussian

@@ -93,7 +93,8 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
 
     merged = {name: mean(name) for name in source if name not in ("means", "scales", "quats", "opacities")}
     merged |= {"means": origin + shift, "scales": deviations.log(), "quats": quats}
-    merged["opacities"] = _logit_of_depth(merged_depth)[:, None]
+    depth = merged_depth.clamp(torch.finfo(merged_depth.dtype).tiny, -math.log1p(-MAX_OPACITY))
+    merged["opacities"] = (depth + torch.log(-torch.expm1(-depth)))[:, None]  # logit of 1 - exp(-depth)
     changed = (torch.bincount(group, minlength=count) > 1) & (largest > 0) & bounded
     for value in merged.values():
         changed &= value.reshape(count, -1).isfinite().all(dim=1)
@@ -101,9 +102,3 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
     for name, value in result.items():
         value[changed] = merged[name][changed].to(value.dtype)
     return result
-
-
-def _logit_of_depth(depth: Tensor) -> Tensor:
-    """Logit of the opacity ``1 - exp(-depth)``, which is ``log(exp(depth) - 1)``; opacity at most ``MAX_OPACITY``."""
-    depth = depth.clamp(torch.finfo(depth.dtype).tiny, -math.log1p(-MAX_OPACITY))
-    return depth + torch.log(-torch.expm1(-depth))

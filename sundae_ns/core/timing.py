@@ -12,11 +12,8 @@ import torch
 
 def now(device: torch.device | str) -> float:
     """Seconds on the host's wall clock, after the device has finished its queued work; only differences count."""
-    device = torch.device(device)
-    if device.type == "cuda":
+    if torch.device(device).type == "cuda":
         torch.cuda.synchronize(device)
-    elif device.type == "mps":
-        torch.mps.synchronize()
     return time.perf_counter()
 
 

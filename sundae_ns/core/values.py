@@ -11,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from sundae_ns.core.errors import ConfigError, DataError
+from sundae_ns.core.errors import ConfigError, DataError, SundaeError, one_line
 
 AnyArray = ArrayLike | Tensor  # lists too
 _WHITE = {"uint8": 255.0, "uint16": 65535.0}  # of stored images, by their type
@@ -41,10 +41,7 @@ def floats(values: Any, name: str, *, colors: bool = False) -> Tensor:
 
     With ``colors``, values of 8 or 16 bits become [0, 1] by their type, and others have to be there.
     """
-    try:
-        given = values if isinstance(values, Tensor) else np.asarray(values)
-    except (TypeError, ValueError) as error:
-        raise DataError(f"{name} is no array of numbers; give a tensor or an array") from error
+    given = values if isinstance(values, Tensor) else np.asarray(values)
     kind = str(given.dtype).removeprefix("torch.") if isinstance(given, Tensor) else given.dtype.name
     if not kind.startswith(("float", "bfloat", "int", "uint")) or (kind in _WHITE and not colors):
         raise DataError(f"{name} has values of type {kind}; give floating-point numbers")
@@ -83,3 +80,15 @@ def usual_defaults() -> Iterator[None]:
             yield
     finally:
         torch.set_default_dtype(given.dtype)
+
+
+@contextmanager
+def fitting() -> Iterator[None]:
+    """:func:`usual_defaults`; what an argument of another type, such as None, raises becomes a ``ConfigError``."""
+    try:
+        with usual_defaults():
+            yield
+    except SundaeError:
+        raise
+    except (TypeError, ValueError, AttributeError, LookupError, ArithmeticError) as error:
+        raise ConfigError(f"an argument does not fit ({one_line(error)}); the docstring says what to give") from error

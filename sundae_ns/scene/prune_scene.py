@@ -85,8 +85,6 @@ def prune(
     >>> sn.prune(scene, keep=0.1, cameras=sn.virtual_cameras(scene, 4, size=32)).num_gaussians
     20
     """
-    if not isinstance(rule, PruneRule | None):
-        raise ConfigError(f"the rule is {rule!r}; give a PruneRule, such as PruneRule(selection='pairs')")
     cameras = None if cameras is None else usable_cameras(cameras)
     return prune_with_mask(scene, keep, count, cameras, rule, progress=progress).scene
 

@@ -18,7 +18,7 @@ from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import BackendError, ConfigError, DataError, one_line
 from sundae_ns.core.gaussians import FEATURES, MAX_SH_DEGREE, Gaussians, checked, rgb_to_sh, sh_to_rgb
 from sundae_ns.core.metrics import Quality, evaluate
-from sundae_ns.core.values import AnyArray, floats, numbers, positions, usual_defaults, whole
+from sundae_ns.core.values import AnyArray, fitting, floats, numbers, positions, whole
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.data.images import to_srgb
 from sundae_ns.data.photos import photo_of, upright
@@ -70,7 +70,7 @@ class Scene:
         put("up", None if self.up is None else unit(self.up))
 
     @classmethod
-    @usual_defaults()
+    @fitting()
     def from_points(cls, points: AnyArray, colors: AnyArray, *, sh_degree: int = 0) -> Scene:
         """A scene of one Gaussian for each point, sized by the distance to its neighbours.
 
@@ -97,7 +97,7 @@ class Scene:
         return cls(Gaussians(from_points(points, colors.to(points.device), sh_degree=sh_degree)))
 
     @classmethod
-    @usual_defaults()
+    @fitting()
     def from_arrays(
         cls, means: AnyArray, scales: AnyArray, quats: AnyArray, opacities: AnyArray, colors: AnyArray
     ) -> Scene:
@@ -135,6 +135,7 @@ class Scene:
     def __len__(self) -> int:
         return self.num_gaussians
 
+    @fitting()
     def __getitem__(self, rows: slice | AnyArray) -> Scene:
         """The scene with some of its Gaussians: ``scene[scene.opacities > 0.1]``; everything else stays, head included.
 
@@ -198,7 +199,7 @@ class Scene:
         """Colour behind the scene ``[3]``, on the device of the scene."""
         return torch.tensor(SHOWN_BACKGROUNDS[self.background_color], dtype=torch.float32, device=self.device)
 
-    @usual_defaults()
+    @fitting()
     def to(self, device: torch.device | str) -> Scene:
         """The scene on another device; stored cameras stay on the CPU. ``BackendError`` if it is not available."""
         try:
@@ -215,6 +216,7 @@ class Scene:
             head = head.train(self.head.training).to(device)
         return dataclasses.replace(self, gaussians=self.gaussians.to(device), head=head)
 
+    @fitting()
     def settings(self, backend: BackendName = "auto", *, head: bool = True) -> RenderSettings:
         """Settings that render the scene with all of its SH degrees; ``BackendError`` without the rasteriser."""
         rasteriser, enabled = select_backend(backend, self.device), self.head if head else None
