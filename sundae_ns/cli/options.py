@@ -27,7 +27,7 @@ def _optional(read: Callable[[str], float], metavar: str) -> PrimitiveConstructo
     return PrimitiveConstructorSpec(1, metavar, lambda words: read(words[0]), lambda _: True, lambda x: [str(x)])
 
 
-Int = Annotated[int | None, _optional(lambda word: int(word.replace(",", "")), "INT"), NO_DEFAULT]
+Int = Annotated[int | None, _optional(int, "INT"), NO_DEFAULT]
 Float = Annotated[float | None, _optional(float, "FLOAT"), NO_DEFAULT]
 File = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 Input = Annotated[Path, tyro.conf.Positional]  # the file or the folder that a command reads

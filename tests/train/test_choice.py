@@ -24,6 +24,7 @@ def test_views_count_by_their_pixels():
 def test_where_no_count_is_best_in_both_figures_the_one_that_loses_least_is_taken():
     losses = [(0.5, 0), (0, 0.006), (0.5, 0.03), (1, 0.1)]
     assert choose([point(n, *loss) for n, loss in zip((1000, 400, 200, 100), losses, strict=True)], Tolerance()) == 400
+    assert choose([point(100), point(50)], Tolerance()) == 50
 
 
 def test_a_budget_in_bytes_is_in_proportion_to_the_one_size_that_is_known():
@@ -61,6 +62,11 @@ def test_the_gain_of_a_head_in_ssim_is_in_decibels_of_its_distance_from_one():
     gain = HeadGain.of(trial(30.0, 0.9), trial(30.5, 0.95))
     assert (gain.psnr, gain.ssim, gain.ssim_db) == pytest.approx((0.5, 0.05, 10 * math.log10(2)))
     assert HeadGain.of(trial(30.0, 0.0), trial(30.5, 0.0)).ssim_db is None
+    assert HeadGain.of(trial(30.0, 0.9), trial(30.5, 1.0)).ssim_db is None
+
+
+def test_the_loss_of_held_out_views_is_that_of_training():
+    assert choice.loss_of([HeldOutQuality(9, 20.0, 0.7)], 0.2) == pytest.approx(0.8 * 0.1 + 0.2 * 0.3)
 
 
 @pytest.mark.parametrize(("views", "held_out"), [(12, 2), (16, 2), (43, 5), (73, 9), (105, 13), (255, 16), (2000, 16)])

@@ -14,7 +14,7 @@ from torch.optim import Adam
 from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.pruning.decision import Pruner
 from sundae_ns.train.initialize import Start
-from sundae_ns.train.pruning import COUNT, UNPRUNED, PruningConfig, prune_when_due, summary
+from sundae_ns.train.pruning import COUNT, UNPRUNED, PruningConfig, ScheduledPruning, prune_when_due, summary
 from sundae_ns.train.schedules import Decay
 
 
@@ -230,6 +230,14 @@ def test_trials_decide_how_many_stay_and_the_prune_waits_for_them():
         assert config.due(decided, 3, 60)
         assert config.target(60, decided) == kept
     assert config.target(5, {**UNPRUNED, COUNT: 7}) == 5
+
+
+def test_a_prune_in_one_shot_adds_none_that_lack_and_a_cap_may_be_the_target():
+    made = gaussians(9)
+    PruningConfig(**CONTINUOUS, max_gaussians=9, target_gaussians=9).validate()
+    run(PruningConfig(target_gaussians=12, prune_at=1, stop=0, num_neighbors=4), made, range(3))
+    assert len(made[0]["means"]) == 9
+    assert not ScheduledPruning(PruningConfig(**CONTINUOUS), evaluate=True).evaluate
 
 
 SPAN = {"mode": "continuous", "start": 4, "stop": 21, "every": 5}
