@@ -113,11 +113,16 @@ def plot_error() -> Any:
     logarithmic(sizes, [0.3, 1, 3, 10])
     frames.set_xlim(0)
     for row in (row for row in lines_of("graph.jsonl") if row["distribution"] in ("field", "uniform")):
-        label, color = ("H100", "tab:green") if row["device"] == "cuda" else ("CPU", "tab:orange")
+        label, color = ("H100, H200", "tab:green") if row["device"] == "cuda" else ("CPU", "tab:orange")
         spot = row["seconds"], row["response_rel_error"]
         graph.plot(*spot, "v", color=color, label=f"graph and response, {label}")
         graph.annotate(f"{row['points'] / 1e6:g}M", spot, (4, 5), textcoords="offset points", fontsize=7)
-    graph.set(xlabel="seconds for millions of points", ylabel="relative error of the response", yscale="log")
+    graph.set(
+        xlabel="seconds for millions of points",
+        ylabel="relative error of the response",
+        yscale="log",
+        ylim=(1e-8, 1e-6),
+    )
     logarithmic(graph, [0.01, 0.1, 1])
     return figure
 
