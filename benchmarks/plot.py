@@ -117,12 +117,7 @@ def plot_error() -> Any:
         spot = row["seconds"], row["response_rel_error"]
         graph.plot(*spot, "v", color=color, label=f"graph and response, {label}")
         graph.annotate(f"{row['points'] / 1e6:g}M", spot, (4, 5), textcoords="offset points", fontsize=7)
-    graph.set(
-        xlabel="seconds for millions of points",
-        ylabel="relative error of the response",
-        yscale="log",
-        ylim=(1e-8, 1e-6),
-    )
+    graph.set(xlabel="seconds for millions of points", ylabel="relative error", yscale="log", ylim=(1e-8, 1e-6))
     logarithmic(graph, [0.01, 0.1, 1])
     return figure
 
