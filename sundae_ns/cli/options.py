@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -22,9 +21,9 @@ T = TypeVar("T")
 NO_DEFAULT = tyro.conf.arg(help_behavior_hint="")  # in the help
 
 
-def _optional(read: Callable[[str], float], metavar: str) -> PrimitiveConstructorSpec[Any]:
+def _optional(kind: type[float], metavar: str) -> PrimitiveConstructorSpec[Any]:
     """How a number that may be left out is read: errors and help of a union would name None beside it."""
-    return PrimitiveConstructorSpec(1, metavar, lambda words: read(words[0]), lambda _: True, lambda x: [str(x)])
+    return PrimitiveConstructorSpec(1, metavar, lambda words: kind(words[0]), lambda _: True, lambda x: [str(x)])
 
 
 Int = Annotated[int | None, _optional(int, "INT"), NO_DEFAULT]
