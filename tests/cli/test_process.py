@@ -18,7 +18,7 @@ from sundae_ns.core.errors import SundaeError
 CHILD = """
 import pathlib, signal, subprocess, sys
 here = pathlib.Path(sys.argv[1])
-grandchild = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
+grandchild = subprocess.Popen(["sleep", "600"])  # no Python, which loses a SIGINT while it starts
 (here / "grandchild").write_text(str(grandchild.pid))
 
 def stop(number, frame):
