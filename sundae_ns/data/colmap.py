@@ -56,8 +56,7 @@ def read_images(model: Path) -> dict[int, ColmapImage]:
     """The images of a model by their numbers, with their cameras; ``DataError`` names the first unusable entry."""
     if not model.is_dir():
         raise DataError(f"{model} is not a folder; give that of the model with colmap --colmap-path (usually sparse/0)")
-    kind = next((kind for kind in ("txt", "bin") if (model / f"cameras.{kind}").exists()), None)
-    if kind is None:
+    if (kind := next((kind for kind in ("txt", "bin") if (model / f"cameras.{kind}").exists()), None)) is None:
         near = beside(model / "cameras.bin")
         raise DataError(f"{model} holds neither cameras.bin nor cameras.txt{near}; give --colmap-path another folder")
     cameras: dict[int, ColmapCamera] = {}
@@ -75,6 +74,7 @@ def read_images(model: Path) -> dict[int, ColmapImage]:
             size = side(width, "width", where), side(height, "height", where)
             cameras[number] = ColmapCamera(*size, *colmap_lens(lens, params, where))
     images: dict[int, ColmapImage] = {}
+    numbers: dict[str, int] = {}
     with _content(model / f"images.{kind}") as content:
         for number, pose, camera, file in _images(content, kind == "txt"):
             where = f"{model / f'images.{kind}'}, image {number}"
@@ -86,6 +86,8 @@ def read_images(model: Path) -> dict[int, ColmapImage]:
                 raise DataError(f"{where}: its camera {camera} is not in the model; export it again")
             if Path(file).is_absolute() or ".." in Path(file).parts:
                 raise DataError(f"{where}: its name {file!r:.80} leads out of the folder of images; rename it")
+            if number in images or numbers.setdefault(file, number) != number:
+                raise DataError(f"{where}: its number or its name {file!r:.80} is listed twice; remove one of the two")
             images[number] = ColmapImage(file, pose, camera, cameras[camera])
     if not images:
         raise DataError(f"{model} has no images; the reconstruction failed, run it again")
@@ -120,11 +122,9 @@ def check_colmap(model: Path, images: Path | None, *, points: bool = True) -> No
     names = [image.name for image in read_images(model).values()]
     if len(names) < 2:
         raise DataError(f"{model} has {len(names)} image; training needs 2 or more")
-    hostile = next((name for name in [str(images or ""), *names] if set(name) & set('"$`\\\n')), None)
-    if hostile is not None:
+    if hostile := next((name for name in [str(images or ""), *names] if set(name) & set('"$`\\\n')), None):
         raise DataError(f"{hostile!r} has quotes, $, ` or backslashes in its name; rename it without them")
-    missing = [images / name for name in names if not (images / name).is_file()] if images is not None else []
-    if missing:
+    if images is not None and (missing := [images / name for name in names if not (images / name).is_file()]):
         raise DataError(f"{missing[0]} does not exist{beside(missing[0])}; check --images-path, or remove the view")
     if points and not len(read_points(model)[0]):
         raise DataError(f"{model} has no points; start without them with colmap --load-3D-points False")

@@ -194,6 +194,7 @@ def _folder(file):
 
 
 _NAME = 8 + 64 + len("frame_00001.png") + 1  # offset of the first image's number of observations
+ROW = "1 1 0 0 0 0 0 3 1"
 MODELS = {
     "2^63 cameras": (_patch("cameras.bin", 0, "<Q", 1 << 63), "is not a complete cameras.bin"),
     "2^40 images": (_patch("images.bin", 0, "<Q", 1 << 40), "is not a complete images.bin"),
@@ -212,7 +213,7 @@ MODELS = {
     "a name above": (_patch("images.bin", 8 + 64, "15s", b"../../a.png.png"), "leads out of the folder of images"),
     "an absolute name": (_patch("images.bin", 8 + 64, "15s", b"/etc/passwd.png"), "leads out of the folder of images"),
     "a name of two lines": (_patch("images.bin", 8 + 64, "15s", b"a\nb.png.png.png"), "has quotes, .*rename it"),
-    "one image": (lambda model: _text(model, "1 1 0 0 0 0 0 3 1 a.png"), "has 1 image; training needs 2"),
+    "one image": (lambda model: _text(model, f"{ROW} a.png"), "has 1 image; training needs 2"),
     "an endless name": (_patch("images.bin", 8 + 64, "10000s", b"a" * 10**4), "is not a complete images.bin"),
     "no images": (_patch("images.bin", 0, "<Q", 0), "has no images"),
     "no points": (_patch("points3D.bin", 0, "<Q", 0), "has no points"),
@@ -221,6 +222,8 @@ MODELS = {
     "a pipe": (lambda model: ((model / "images.bin").unlink(), os.mkfifo(model / "images.bin")), "it is a pipe"),
     "no file of cameras": (lambda model: (model / "cameras.bin").unlink(), "holds neither cameras.bin nor cameras.txt"),
     "a camera twice": (_twice, "camera 1: it is listed twice"),
+    "a number twice": (lambda model: _text(model, f"{ROW} a.png\n\n{ROW} b.png"), "image 1: .* is listed twice"),
+    "a name twice": (lambda model: _text(model, f"{ROW} a.png\n\n2{ROW[1:]} a.png"), "image 2: .*'a.png' is .* twice"),
     "a folder in the place of a file": (_folder("cameras.bin"), "cannot be read"),
     "a folder in the place of a text": (_folder("cameras.txt"), "cannot be read"),
     "invalid UTF-8": (lambda model: (model / "cameras.txt").write_bytes(b"1 PIN\xff\xfe"), "cameras.txt .*utf-8"),
