@@ -56,12 +56,12 @@ class Scene:
     meta: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """JSON values that a packed scene carries along: ``frame``, ``capture``, ``source``."""
 
+    @fitting()
     def __post_init__(self) -> None:
         put = super().__setattr__  # of a frozen class
         put("gaussians", checked(self.gaussians))
         features = self.gaussians[FEATURES].shape[1] if FEATURES in self.gaussians else 0
-        if self.head is not None and features != self.head.config.num_features:
-            wanted = self.head.config.num_features
+        if self.head is not None and features != (wanted := self.head.config.num_features):
             raise DataError(f"the head reads {wanted} features and the Gaussians have {features}; leave the head out")
         if self.background_color not in SHOWN_BACKGROUNDS:
             raise ConfigError(f"the background is {self.background_color!r}; give {', '.join(SHOWN_BACKGROUNDS)}")

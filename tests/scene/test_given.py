@@ -98,6 +98,7 @@ REFUSED = {
     "colours to 255": (lambda: sn.Scene.from_points(POINTS, 255 * POINTS), r"colors has values from .* give uint8"),
     "words": (lambda: sn.Scene.from_points([["a"] * 3], POINTS), "points has values of type str"),
     "ragged": (lambda: sn.Scene.from_points([[1, 2], [3]], POINTS), "an argument does not fit .*inhomogeneous"),
+    "ragged means": (lambda: sn.Scene({**SCENE.gaussians, "means": [[1, 2], [3]]}), "does not fit .*inhomogeneous"),
     "flags": (lambda: sn.Scene.from_points(POINTS > 0.5, POINTS), "points has values of type bool"),
     "shape": (lambda: sn.Scene.from_points(POINTS[:, :2], POINTS), r"\[100, 2\] and \[100, 3\]"),
     "NaN points": (lambda: sn.Scene.from_points(POINTS * np.nan, POINTS), "some points are NaN"),
