@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields
+from itertools import compress
 from pathlib import Path
 from types import FunctionType, SimpleNamespace
 from typing import Any
@@ -358,18 +359,18 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
     kinds = cameras.camera_type.flatten()
     unknown = ~torch.isin(kinds, torch.tensor(list(TYPES.values()), dtype=kinds.dtype))
     if unknown.any():
-        what = f"{names[unknown.tolist().index(True)].name} is of type {CameraType(int(kinds[unknown][0])).name}"
+        what = f"{next(compress(names, unknown)).name} is of type {CameraType(int(kinds[unknown][0])).name}"
         raise DataError(f"the camera of {what}; cut its images into perspective ones, such as cube faces")
     mirrored = torch.linalg.det(cameras.camera_to_worlds[:, :, :3]) < 0
     if mirrored.any():
-        which = f"{names[mirrored.tolist().index(True)].name} mirrors an axis ({mirrored.sum()} of {len(names)} do)"
+        which = f"{next(compress(names, mirrored)).name} mirrors an axis ({mirrored.sum()} of {len(names)} do)"
         raise DataError(f"the pose of {which}; negate one column of its rotation")
     ratios = (cameras.fx / cameras.width.clamp_min(1)).flatten()
     strange = (ratios < 0.01) | (ratios > 1000)  # views of 178 and of 0.06 degrees
     if strange.any():
-        i = strange.tolist().index(True)
-        size = f"{float(cameras.fx[i]):.3g} px and the image is {int(cameras.width[i])} px wide"
-        raise DataError(f"the focal length of {names[i].name} is {size}, which no lens has; give it in pixels")
+        size = f"{float(cameras.fx[strange][0]):.3g} px and the image is {int(cameras.width[strange][0])} px wide"
+        which = next(compress(names, strange)).name
+        raise DataError(f"the focal length of {which} is {size}, which no lens has; give it in pixels")
     if points is not None:
         warn_of_cloud(points, cameras)
     centres = cameras.camera_to_worlds[:, :, 3]
@@ -384,8 +385,8 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
     if not far.any() and usual > 0 and (far := distances > 20 * usual).any() and len(cloud):
         far &= distances > STRAY * float((cloud.double() - middle).norm(dim=1).median())
     if far.any():
-        times = f"{float(distances[far.tolist().index(True)] / usual):,.0f} times as far away as most"
-        which = f"{names[far.tolist().index(True)].name} is {times if usual > 0 else 'far from all others'}"
+        times = f"{float(distances[far][0] / usual):,.0f} times as far away as most"
+        which = f"{next(compress(names, far)).name} is {times if usual > 0 else 'far from all others'}"
         warn(f"the camera of {which} ({int(far.sum())} of {len(names)} are); check its pose, or remove the view")
 
 
@@ -398,7 +399,7 @@ def check_tests(train: Any, test: Any) -> None:
     centres = torch.cat([data.cameras.camera_to_worlds[:, :, 3] for data in (train, test)]).double().cpu()
     far = torch.from_numpy(stray_cameras(centres.numpy()))[-len(names) :]
     if far.any():
-        which = f"{names[far.tolist().index(True)].name}, a test view, stands far from all others"
+        which = f"{next(compress(names, far)).name}, a test view, stands far from all others"
         warn(f"the camera of {which} ({int(far.sum())} of {len(names)} do); check its pose, or remove the view")
 
 

@@ -194,8 +194,7 @@ class Judge:
         return self._quality()
 
     def _quality(self) -> Quality:
-        model = self._model
-        return evaluate(lambda camera: model.get_outputs_for_camera(camera)["rgb"], self._cameras, self._truths)
+        return evaluate(lambda camera: self._model.get_outputs_for_camera(camera)["rgb"], self._cameras, self._truths)
 
 
 def is_worth(psnr: float, size: int, other_psnr: float, other_size: int) -> bool:
