@@ -4,20 +4,13 @@ import json
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-import harness.job as job_module  # noqa: E402
-from harness.plan import Job, parser_of  # noqa: E402
-from sundae_ns.train import choice, trials  # noqa: E402
+from few_job import few_job  # its import finds the harness
+
+import harness.job as job_module
+from sundae_ns.train import choice, trials
 
 capture, out, *words = sys.argv[1:]
-data = Path(capture)
-parser = list(parser_of(data))
-if any(path.name.startswith("eval_") for path in (data / "images").iterdir()):
-    at = parser.index("interval")
-    parser = [*parser[:at], "filename", *parser[at + 3 :]]
-seed = 42
-if words and words[0] == "--seed":
-    seed, words = int(words[1]), words[2:]
+job = few_job(capture, f"rest-{Path(capture).name}", "rest", "sundae", 30000, words)
 made, rows = {}, []
 trainer_of, measure = job_module.trainer_of, trials.Trials.measure
 
@@ -43,13 +36,10 @@ job_module.trainer_of = keep_trainer
 trials.Trials.measure = measure_both
 trials.WATCHED_SHARE = 1.0
 choice.best_length = lambda *given: (1, False)
-words = ["--pipeline.model.evaluate-prune", "False", *words]
-name = f"rest-{data.name}-{seed}"
-job = Job(name, "whole", data.name, "rest", str(data), "sundae", 30000, seed, options=tuple(words), parser=tuple(parser))
-folder = Path(out) / name
+folder = Path(out) / job.key
 config, command = job_module.configure(job, folder)
 _, measured = job_module._measured(job, config, command)
 plain = measured.as_json()
 record = json.loads(next(folder.glob("jobs/*/*/*/run/trials.json")).read_text())
 final = plain["configurations"][0]["mean"]
-Path(out, f"{name}.json").write_text(json.dumps({"capture": data.name, "seed": seed, "count": plain["primitives"], "rows": rows, "final": final, "trials": record}) + "\n")
+Path(out, f"{job.key}.json").write_text(json.dumps({"capture": job.scene, "seed": job.seed, "count": plain["primitives"], "rows": rows, "final": final, "trials": record}) + "\n")

@@ -1,0 +1,21 @@
+"""The job of a capture that lab/cut.py may have cut, by words of ns-train."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+from harness.plan import Job, parser_of  # noqa: E402
+
+
+def few_job(capture: str, key: str, arm: str, method: str, steps: int, words: list[str]) -> Job:
+    """``words`` may begin with ``--seed K``; the key of the job ends with the seed."""
+    data, seed = Path(capture), 42
+    parser = list(parser_of(data))
+    if any(path.name.startswith("eval_") for path in (data / "images").iterdir()):
+        at = parser.index("interval")
+        parser = [*parser[:at], "filename", *parser[at + 3 :]]
+    if words and words[0] == "--seed":
+        seed, words = int(words[1]), words[2:]
+    options = ("--pipeline.model.evaluate-prune", "False", *words)
+    name = f"{key}-{seed}"
+    return Job(name, "whole", data.name, arm, str(data), method, steps, seed, options=options, parser=tuple(parser))
