@@ -33,9 +33,12 @@ signal.pause()
 """
 
 
-def test_the_exit_code_is_the_command_s():
-    for code, expected in (("pass", 0), ("raise SystemExit(7)", 7), ("import os; os.kill(os.getpid(), 9)", 137)):
-        assert run_command([sys.executable, "-c", code]) == expected
+def test_the_exit_code_is_the_command_s_and_no_word_reaches_a_shell(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    codes = {"raise SystemExit(7)": 7, "import os; os.kill(os.getpid(), 9)": 137}
+    for code, expected in {**codes, f"import sys; raise SystemExit(sys.argv[1] != {NASTY!r})": 0}.items():
+        assert run_command([sys.executable, "-c", code, NASTY]) == expected
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_command_gets_no_input():
@@ -47,13 +50,6 @@ def test_the_command_gets_no_input():
     finally:
         os.dup2(before, 0)
         os.close(before)
-
-
-def test_no_word_reaches_a_shell(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    code = f"import sys; raise SystemExit(sys.argv[1] != {NASTY!r})"
-    assert run_command([sys.executable, "-c", code, NASTY]) == 0
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])

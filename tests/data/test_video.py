@@ -136,7 +136,8 @@ def test_interlaced_frames_have_no_comb(tmp_path):
 
 def test_the_sharpest_frame_of_each_stretch(tmp_path):
     write_video(tmp_path / "A WALK.MP4", 60)
-    assert is_video(tmp_path / "A WALK.MP4")
+    (tmp_path / "folder.mp4").mkdir()
+    assert [is_video(tmp_path / name) for name in ("A WALK.MP4", "folder.mp4")] == [True, False]
     done = []
     found = frames_from(tmp_path / "A WALK.MP4", 20, done.append)
     assert len(found) == sum(done) == 20
@@ -165,11 +166,6 @@ def test_all_frames_of_a_short_video_are_there_only_once_they_are_whole(tmp_path
     assert [path.name for path in sorted((tmp_path / "a").iterdir())] == [f"{i:05d}.jpg" for i in range(1, 8)]
 
 
-def test_a_folder_is_no_video(tmp_path):
-    (tmp_path / "folder.mp4").mkdir()
-    assert not is_video(tmp_path / "folder.mp4")
-
-
 def half(path):
     write_video(path, 40)
     path.write_bytes(path.read_bytes()[:400])
@@ -196,18 +192,15 @@ def replaced(old, new, **options):
     return make
 
 
-def test_a_damaged_turn_is_none(tmp_path):
-    turn = replaced(
-        struct.pack(">5i", -65536, 0, 0, 0, -65536), struct.pack(">5i", -65536, 0, 0, 0, 0), turn=(180, False)
-    )
-    turn(tmp_path / "a.mp4")
-    assert len(frames_from(tmp_path / "a.mp4")) == 5
+TURN, NONE = (struct.pack(">5i", -65536, 0, 0, 0, last) for last in (-65536, 0))
+DAMAGED = {f"a title in Latin-1{suffix}": replaced(b"a title", b"\xe4 title") for suffix in (".mp4", ".mkv", ".avi")}
+DAMAGED |= {"a turn of nothing.mp4": replaced(TURN, NONE, turn=(180, False))}
 
 
-@pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".avi"])
-def test_a_title_in_another_encoding_than_utf_8(tmp_path, suffix):
-    replaced(b"a title", b"\xe4 title")(tmp_path / f"a{suffix}")
-    assert len(frames_from(tmp_path / f"a{suffix}")) == 5
+@pytest.mark.parametrize("name", DAMAGED)
+def test_damage_beside_the_frames_costs_none(tmp_path, name):
+    DAMAGED[name](tmp_path / name)
+    assert len(frames_from(tmp_path / name)) == 5
 
 
 def playlist(text):

@@ -72,10 +72,16 @@ def test_the_width_is_the_lower_median_of_positive_distances(sampled, monkeypatc
     assert graph._typical_distance(torch.zeros(3, 2)) == graph._typical_distance(torch.zeros(0, 2)) == 1.0
 
 
-def test_a_given_width_sets_the_reach_and_may_overflow():
+def test_a_given_width_sets_the_reach_and_may_overflow_as_distances_may():
     for sigma, tau in ((2.0, 36.0), (1e200, math.inf)):
         found = build_graph(normal(20), num_neighbors=4, sigma=sigma)
         assert (found.tau, found.sigma) == (tau, sigma)
+    points = torch.cat([torch.randn(20, 3), torch.tensor([[3e38, 3e38, 3e38]])])
+    found = build_graph(points, num_neighbors=6, sigma=float("inf"))
+    assert set(found.weights.unique().tolist()) == {0.0, 1.0}
+    two = build_graph(torch.tensor([[0.0, 0, 0], [1.0, 0, 0]]), num_neighbors=1)  # the smallest graph
+    assert two.sigma == 1.0
+    torch.testing.assert_close(two.weights, torch.full((2, 1), math.exp(-0.5)))
 
 
 def test_symmetries_are_followed():
@@ -91,12 +97,6 @@ def test_symmetries_are_followed():
     expected = magnitude(points)
     torch.testing.assert_close(magnitude(points @ rotation.T), expected, rtol=1e-9, atol=1e-15, equal_nan=True)
     assert torch.equal(magnitude(points[order]).nan_to_num(-1), expected[order].nan_to_num(-1))
-
-
-def test_the_smallest_graph():
-    two = build_graph(torch.tensor([[0.0, 0, 0], [1.0, 0, 0]]), num_neighbors=1)
-    assert two.sigma == 1.0
-    torch.testing.assert_close(two.weights, torch.full((2, 1), math.exp(-0.5)))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -119,12 +119,6 @@ def test_any_cells_at_any_scale(cells, exponent, shift, tau, double):
     assert tau in (None, graph.tau)
     assert tau != 0 or not graph.weights.any()
     assert tau != float("inf") or not graph.isolated.any()
-
-
-def test_an_overflowing_distance_and_an_infinite_width_give_no_nan():
-    points = torch.cat([torch.randn(20, 3), torch.tensor([[3e38, 3e38, 3e38]])])
-    graph = build_graph(points, num_neighbors=6, sigma=float("inf"))
-    assert set(graph.weights.unique().tolist()) == {0.0, 1.0}
 
 
 @pytest.mark.gpu

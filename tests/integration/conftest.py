@@ -150,6 +150,5 @@ def trainer_of(tiny, tmp_path):
 @pytest.fixture
 def resumed(trainer_of):
     """Resume a run, of the checkpoints in a folder, after a step and for some steps."""
-    return lambda folder, step, steps, **options: trainer_of(
-        load_dir=folder, load_step=step, max_num_iterations=steps, **options
-    )
+    names = ("load_dir", "load_step", "max_num_iterations")
+    return lambda *start, **options: trainer_of(**dict(zip(names, start, strict=True)), **options)

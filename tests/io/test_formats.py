@@ -119,17 +119,14 @@ def test_survey_coordinates_are_moved_stated_and_kept(tmp_path, kind, caplog):
     assert sn.cameras_of(tmp_path / "c.json", back if kind == ".sundae" else scene)[0].center[0] == 4e6 + 1 - offset[0]
 
 
-def test_a_text_that_states_floats_has_all_its_digits(tmp_path):
-    truth, path = write_survey(tmp_path / "a.ply", 4e6), tmp_path / "a.ply"
-    write_columns(path, columns_of(path), text=True)
+def test_rows_of_a_survey_keep_their_digits_in_text_and_in_a_prune(tmp_path):
+    """Also where the text states floats."""
+    truth, mask, path = write_survey(tmp_path / "a.ply", 5e5), torch.arange(300) < 200, tmp_path / "text.ply"
+    write_columns(path, columns_of(tmp_path / "a.ply"), text=True)
     path.write_bytes(path.read_bytes().replace(b"property double ", b"property float "))
     scene = sn.load(path)
     means = scene.gaussians["means"].double() + torch.tensor(scene.offset, dtype=torch.float64)
     torch.testing.assert_close(means, truth, rtol=0, atol=2e-6)
-
-
-def test_pruned_rows_of_a_survey_are_its_own_coordinates(tmp_path):
-    truth, mask = write_survey(tmp_path / "a.ply", 5e5), torch.arange(300) < 200
     moved, _ = read_gaussian_file(tmp_path / "a.ply")
     keep_vertices(tmp_path / "a.ply", tmp_path / "b.ply", mask, moved.gaussians.rows(mask))
     means = read_point_cloud(tmp_path / "b.ply", precise=True)[0]

@@ -281,13 +281,10 @@ def test_other_colours(tmp_path):
     assert points_and_colors(path, None) == (XYZ.tolist(), [[128] * 3] * 2)
 
 
-def test_precise_positions(tmp_path):
+def test_precise_positions_and_files_without_points(tmp_path):
     far = [5_412_330.123, 1e-9, -4e6 - 0.1]
     write_columns(tmp_path / "a.ply", {name: np.array([value]) for name, value in zip("xyz", far, strict=True)})
     assert read_point_cloud(tmp_path / "a.ply", precise=True)[0].tolist() == [far]
-
-
-def test_files_without_points_are_refused(tmp_path):
     refused(read_point_cloud, tmp_path / "gone.ply", "cannot be read")
     write_columns(tmp_path / "a.ply", {"x": np.zeros(2), "y": np.zeros(2)})
     refused(read_point_cloud, tmp_path / "a.ply", "without x, y and z")

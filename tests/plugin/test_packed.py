@@ -1,4 +1,4 @@
-"""Runs as packed scenes: what is stored, what is not, and headers with false claims."""
+"""Runs as packed scenes: what is stored, what is not, and captures with false claims."""
 
 import copy
 from dataclasses import replace
@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from documents import put
 from fields import random_field
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
@@ -68,29 +67,6 @@ def test_a_packed_scene_becomes_a_model():
 def test_a_folder_without_a_capture_is_refused(tmp_path):
     with pytest.raises(DataError, match=str(tmp_path / "gone")):
         datamanager_of(scene_of(scene()), tmp_path / "gone")
-
-
-LIES = {
-    "model": [None, "yes"],
-    "model/sh_degree": [10**6, True, 0],  # 0 is too low
-    "model/rasterize_mode": ["os.system"],
-    "model/background_color": [["white"]],
-    "model/head": [None, "residual"],
-    "model/head/size": ["regular"],
-    "model/head/mode": ["off"],
-    "model/head/pixel_unshuffle": [10**6],
-    "model/head/num_features": [6],
-    "model/head/_target": ["os.system"],
-    "model/trained_focal": [[-1.0, 2.0], [1.0]],
-}
-
-
-@pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in LIES.items() for value in values])
-def test_headers_that_lie_are_refused(name, value):
-    stated = scene()
-    put(stated.meta, {name: value})
-    with pytest.raises(PackError):
-        scene_of(stated)
 
 
 @pytest.mark.parametrize(

@@ -97,10 +97,8 @@ def test_a_merge_keeps_the_weighted_sum_of_colours(edges):
     found = (total[:, None] * decision.values["features_dc"]).sum(dim=0)
     expected = (WEIGHTS * (labels >= 0)) @ params["features_dc"]
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
-    # A merge does not change the selection.
-    assert torch.equal(
-        decide_share(params, draws(edges=edges, redistribution="none"), 0.1, WEIGHTS).mask, decision.mask
-    )
+    plain = decide_share(params, draws(edges=edges, redistribution="none"), 0.1, WEIGHTS)
+    assert torch.equal(plain.mask, decision.mask), "a merge does not change the selection"
 
 
 @pytest.mark.parametrize("rule", [{}, {"score": "response", "edges": "centres"}])
@@ -176,9 +174,12 @@ def test_equal_pairs_merge_many_at_once():
     assert len(chosen) > 50
 
 
-def test_clones_that_share_their_neighbours_end(monkeypatch):
+def test_clones_that_share_their_neighbours_and_a_gaussian_that_overflows_end(monkeypatch):
     monkeypatch.setattr(merge, "MOST_ROUNDS", 3)
     assert prune_gaussians(row(*[0.0] * 256), PAIRS, 64, torch.ones(256)).gaussians.num_gaussians == 64
+    gaussians = points()
+    gaussians["scales"][5] = 400.0  # it overflows
+    assert prune_gaussians(gaussians, PAIRS, 40, torch.ones(400)).gaussians.num_gaussians == 40
 
 
 def test_of_islands_the_heaviest_stay():
@@ -189,12 +190,6 @@ def test_of_islands_the_heaviest_stay():
     assert (kept // 20).tolist() == [1, 3]
     assert (labels[:20] == -1).all()
     assert (labels[20:40] >= 0).all()
-
-
-def test_a_gaussian_that_overflows_stops_nothing():
-    gaussians = points()
-    gaussians["scales"][5] = 400.0
-    assert prune_gaussians(gaussians, PAIRS, 40, torch.ones(400)).gaussians.num_gaussians == 40
 
 
 def test_a_merge_by_pairs_loses_less_than_draws():

@@ -287,9 +287,8 @@ def test_gradients_of_some_inputs_by_some_outputs(wanted, output):
     for backend in (CPU, REFERENCE):
         leaves = {name: value.double().requires_grad_(name in wanted) for name, value in values.items()}
         loss = getattr(splat(leaves, make_view(24, 20), backend, render_depth=True), output).square().sum()
-        grads.append(
-            torch.autograd.grad(loss, [leaves[name] for name in wanted], materialize_grads=True, allow_unused=True)
-        )
+        asked = [leaves[name] for name in wanted]
+        grads.append(torch.autograd.grad(loss, asked, materialize_grads=True, allow_unused=True))
     for ours, exact in zip(*grads):
         assert deviation(ours, exact) < 1e-10  # measured: 1.5e-14
 
@@ -417,10 +416,9 @@ def test_no_gaussians_are_an_empty_image_and_float64_is_refused():
     values, camera = crowd(1.0, n=0)
     assert not render(values, camera, F32, on_gpu("gsplat"), "cuda")["image"].any()
     assert select_backend("auto", "cuda").name == "gsplat"
+    directions = torch.ones(1, 3, device="cuda", dtype=F64)
     with pytest.raises(BackendError, match="float32 on cuda"):
-        spherical_harmonics(
-            0, torch.ones(1, 3).cuda().double(), torch.ones(1, 1, 3).cuda().double(), backend=on_gpu("auto")
-        )
+        spherical_harmonics(0, directions, directions[:, None], backend=on_gpu("auto"))
 
 
 # ------------------------------------------------------------------------------------------ promises of compiled loops

@@ -162,17 +162,14 @@ def test_a_small_image_of_many_primitives_is_drawn(backend, monkeypatch):
     assert camera(20_000, 16, 1e-3, backend=backend).max() > 0
 
 
-def test_a_training_whose_lists_exceed_the_memory_is_refused(monkeypatch):
+def test_images_and_lists_of_a_training_that_exceed_the_memory_are_refused(monkeypatch):
+    monkeypatch.setattr(limits, "available_memory", lambda: 1 << 30)
+    with pytest.raises(MemoryExhaustedError, match=r"images of 65,536 x 65,536 pixels take 274\.9 GB, but 1\.1 GB are"):
+        camera(10, 65_536, 1e-3)
     monkeypatch.setattr(limits, "_NEGLIGIBLE", 0)
     monkeypatch.setattr(limits, "available_memory", lambda: 1_000_000)
     with pytest.raises(MemoryExhaustedError, match="pairs of a tile and a Gaussian take .* GB, but .* are available"):
         camera(1000, 64, 20.0, training=True)
-
-
-def test_images_that_exceed_the_memory_are_refused(monkeypatch):
-    monkeypatch.setattr(limits, "available_memory", lambda: 1 << 30)
-    with pytest.raises(MemoryExhaustedError, match=r"images of 65,536 x 65,536 pixels take 274\.9 GB, but 1\.1 GB are"):
-        camera(10, 65_536, 1e-3)
 
 
 def test_the_memory_is_that_of_machine_and_control_group(tmp_path, monkeypatch):

@@ -200,20 +200,24 @@ LIES = [
     ("start", {**START, "pose": [[1, 0, 0, 1e30], *POSE[1:]]}),
     ("start", {**START, "size": [0, 3]}),
     ("model", None),
-    ("model.sh_degree", 1),
-    ("model.background_color", "__proto__"),
-    ("model.head", {"mode": "residual"}),
+    *(("model.sh_degree", degree) for degree in (1, 10**6, True)),
+    ("model.rasterize_mode", "os.system"),
+    *(("model.background_color", color) for color in ("__proto__", ["white"])),
+    *(("model.head", head) for head in (None, "residual", {"mode": "residual"})),
+    ("model.head.mode", "off"),
+    ("model.head._target", "os.system"),
     ("model.head.size", "compact"),
     ("model.head.num_features", 4),
     ("model.head.pixel_unshuffle", 2),
-    ("model.trained_focal", [0, 1]),
+    *(("model.trained_focal", focal) for focal in ([0, 1], [-1.0, 2.0], [1.0])),
     ("source", []),
 ]
 """Places in the header, and values that no packed scene has there."""
 
 
-@needs_node
-def test_the_decoder_refuses_what_python_refuses(decode, packed, tmp_path):
+@pytest.fixture
+def refused(packed, tmp_path):
+    """Files that Python refuses, by what is wrong with them."""
     good = packed.read_bytes()
     meta, body = header_and_body(good)
     files = {"truncated": good[:-1], "longer": good + b"x", "empty": b"", "another file": b"ply\n" + good[4:]}
@@ -222,13 +226,21 @@ def test_the_decoder_refuses_what_python_refuses(decode, packed, tmp_path):
     files |= {f"{path} {value}": sealed(with_lie(meta, path, value), body) for path, value in LIES}
     middle, end = second_half_of_a_stream(meta["sections"])
     files["a broken stream, under a valid checksum"] = resealed(meta, body[:middle] + bytes(end - middle) + body[end:])
-    paths = []
-    for i, content in enumerate(files.values()):
-        paths.append(tmp_path / f"{i}.sundae")
-        paths[-1].write_bytes(content)
+    paths = {name: tmp_path / f"{i}.sundae" for i, name in enumerate(files)}
+    for name, path in paths.items():
+        path.write_bytes(files[name])
         with pytest.raises(PackError):
-            scene_of(read_scene(paths[-1]))
-    for name, found in zip(files, decode(*paths), strict=True):
+            scene_of(read_scene(path))
+    return paths
+
+
+def test_python_refuses_files_that_lie(refused):
+    assert len(refused) > len(LIES) > 30
+
+
+@needs_node
+def test_the_decoder_refuses_what_python_refuses(decode, refused):
+    for name, found in zip(refused, decode(*refused.values()), strict=True):
         assert "error" in found, name
         assert re.fullmatch(r"The [^\n]{10,200}\.", found["error"]), found
 

@@ -17,11 +17,6 @@ N = 60  # Gaussians of a model that is built without a count
 VIEWER_KEYS = {"rgb": 3, "base_rgb": 3, "depth": 1, "accumulation": 1, "features": 3, "response": 1, "background": 3}
 
 
-@pytest.fixture
-def model(build, perturb):
-    return perturb(build()).eval()
-
-
 @pytest.mark.parametrize("size", [(30, 30), (31, 47), (97, 33)])
 @pytest.mark.parametrize("mode", ["residual", "features", "off"])
 @torch.no_grad()

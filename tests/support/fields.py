@@ -16,20 +16,10 @@ from sundae_ns.rasterize.reference import harmonic_basis
 
 def random_field(n: int = 600, degree: int = 2, features: int = 5, seed: int = 0) -> dict[str, Tensor]:
     """Parameters of ``n`` Gaussians, float32; quaternions are not normalised, and 0 leaves the features out."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(n, *shape, generator=generator)
-
-    made = {
-        "means": normal(3),
-        "scales": normal(3) - 5,
-        "quats": normal(4),
-        "features_dc": normal(3),
-        "features_rest": 0.1 * normal((degree + 1) ** 2 - 1, 3),
-        "opacities": 2 * normal(1),
-    }
-    return made | ({"features": normal(features)} if features else {})
+    made = normal_field(n, degree=degree, features=features, seed=seed)
+    for name, factor, shift in (("scales", 1, -5), ("features_rest", 0.1, 0), ("opacities", 2, 0)):
+        made[name] = factor * made[name] + shift
+    return made
 
 
 def normal_field(

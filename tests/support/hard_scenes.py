@@ -27,7 +27,7 @@ def with_values(rows, **values):
     return made
 
 
-HALF, ALL = slice(150), slice(None)
+HALF, ALL, NEEDLE = slice(150), slice(None), [math.log(1e3), *2 * [math.log(1e-8)]]
 
 
 def around_the_near_plane():
@@ -61,12 +61,7 @@ CASES = {
     "ordinary": (scene, 48, 5e-6, 2e-5),
     "scales of 1e-8": (lambda: with_values(HALF, scales=math.log(1e-8)), 48, 5e-6, 2e-5),
     "scales of 1e3": (lambda: with_values(HALF, scales=math.log(1e3)), 48, 5e-6, 2e-5),
-    "needles of 1e3 and 1e-8": (
-        lambda: with_values(HALF, scales=[math.log(1e3), *2 * [math.log(1e-8)]]),
-        48,
-        5e-5,
-        1e-3,
-    ),  # measured 6.5e-6 and 1.6e-4
+    "needles of 1e3 and 1e-8": (lambda: with_values(HALF, scales=NEEDLE), 48, 5e-5, 1e-3),  # measured 6.5e-6, 1.6e-4
     "logits of 30": (lambda: with_values(HALF, opacities=30.0), 48, 5e-6, 2e-5),
     "logits of -30": (lambda: with_values(HALF, opacities=-30.0), 48, 5e-6, 2e-5),
     "on and behind the near plane": (around_the_near_plane, 48, 5e-6, 2e-5),

@@ -91,14 +91,12 @@ class Training:
     def __init__(self, model, trainer=None):
         self.model = model
         groups = model.get_param_groups()
-        kinds = dict.fromkeys(groups, FusedAdamConfig(lr=5e-3)) | {
-            "compensation": FusedAdamConfig(lr=5e-3, weight_decay=1.0, decoupled=True)
-        }
+        of_head = FusedAdamConfig(lr=5e-3, weight_decay=1.0, decoupled=True)
+        kinds = dict.fromkeys(groups, FusedAdamConfig(lr=5e-3)) | {"compensation": of_head}
         self.optimizers = Optimizers({name: {"optimizer": kinds[name], "scheduler": None} for name in groups}, groups)
         pipeline = SimpleNamespace(datamanager=FakeDatamanager(), model=model)
-        self.callbacks = model.get_training_callbacks(
-            TrainingCallbackAttributes(self.optimizers, None, pipeline, trainer)
-        )
+        attributes = TrainingCallbackAttributes(self.optimizers, None, pipeline, trainer)
+        self.callbacks = model.get_training_callbacks(attributes)
 
     @property
     def train_callbacks(self):
@@ -148,6 +146,12 @@ def _fixture_of(function):
 
 
 points, build, perturb, camera, batch = map(_fixture_of, (_points, _build, _perturb, _camera, _batch))
+
+
+@pytest.fixture
+def model():
+    """A model whose head is enabled, for evaluation."""
+    return _perturb(_build()).eval()
 
 
 @pytest.fixture

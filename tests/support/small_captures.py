@@ -32,9 +32,8 @@ def manager(data: Path, *, colmap: bool = False, downscale_factor: int | None = 
     parser: Any = NerfstudioDataParserConfig(load_3D_points=True, downscale_factor=downscale_factor)
     if colmap:
         parser = ColmapDataParserConfig(colmap_path=Path("sparse/0"), eval_mode="all")
-    return SundaeDatamanagerConfig(data=data, dataparser=parser, cache_images_type="uint8").setup(
-        device="cpu", test_mode="val"
-    )
+    config = SundaeDatamanagerConfig(data=data, dataparser=parser, cache_images_type="uint8")
+    return config.setup(device="cpu", test_mode="val")
 
 
 def load(data: Path, *, colmap: bool = False) -> SundaeDatamanager:

@@ -24,9 +24,8 @@ LENGTH = 5
 
 
 def tiny_scene(folder: Path, cameras: int) -> Path:
-    return write_still_life(
-        folder / str(cameras), train_views=cameras, test_views=2, width=24, height=24, points=200, samples=1
-    )
+    size = {"width": 24, "height": 24, "points": 200, "samples": 1}
+    return write_still_life(folder / str(cameras), train_views=cameras, test_views=2, **size)
 
 
 def set_options(config: Any, options: Mapping[str, Any]) -> None:

@@ -32,9 +32,7 @@ GOLDEN = json.loads(Path(__file__).with_name("golden_trials.json").read_text())
 def count_choice(measured: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
     """What trials of counts decide."""
     rows = zip(measured["counts"], measured["measured"], measured["sizes"], strict=True)
-    plain = curve_of(
-        [Tried("count", n, "plain", 600, views, None if size is None else [size, 0]) for n, views, size in rows]
-    )
+    plain = curve_of([Tried("count", n, "plain", 600, views, size and [size, 0]) for n, views, size in rows])
     tolerance, pays, curve = Tolerance.of_drop(options.get("max_drop")), None, plain
     limits = {"most": options.get("max_gaussians"), "most_bytes": options.get("max_bytes")}
     tenth = round(0.1 * measured["full"])

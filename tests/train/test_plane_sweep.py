@@ -81,9 +81,8 @@ def test_of_more_points_than_wanted_an_even_part_is_found(capture, swept):
     points, colours = points_of(*capture, wanted=100)
     assert 100 < len(points) == len(colours) < 100 * plane_sweep._LOOKED_AT
     found, whole = torch.cat([points, colours], dim=1), torch.cat(swept, dim=1)
-    assert torch.allclose(
-        found, whole[torch.cdist(found, whole, compute_mode="donot_use_mm_for_euclid_dist").argmin(dim=1)], atol=1e-6
-    )
+    nearest = torch.cdist(found, whole, compute_mode="donot_use_mm_for_euclid_dist").argmin(dim=1)
+    assert torch.allclose(found, whole[nearest], atol=1e-6)
     assert torch.allclose(points.mean(dim=0), swept[0].mean(dim=0), atol=0.05 * float(swept[0].std()))
 
 

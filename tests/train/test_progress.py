@@ -59,10 +59,7 @@ def test_the_time_left_does_not_jump():
     assert all(1 / 1.5 < after / before < 1.5 for before, after in zip(later, later[1:]))
     half = len(found) // 2
     assert 0.6 < found[half][0] / (now - found[half][1]) < 1.5, "and it is right"
-
-
-def test_a_lasting_change_is_followed():
-    watch, now = TimeLeft(), 0.0
+    watch, now = TimeLeft(), 0.0  # a lasting change is followed
     for done in range(0, 3001, 10):
         now += 10 * (0.1 if done < 500 else 1.0)
         watch.update(done, 3000, now)

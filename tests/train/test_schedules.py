@@ -78,9 +78,7 @@ def test_a_twentieth_of_the_steps():
         "head": "after 600, if trials favour it",
         "learning rates": "decay until 1,500",
     }
-
-
-def test_resets_keep_their_share_of_a_run_that_has_time_for_them():
+    # Resets keep their share of a run that has time for them.
     resets = dict(schedules.schedule_table(fitted("sundae", 15000)))["densification"]
     assert resets == "250 to 6,000, every 50; opacities reset every 1,500"
 
@@ -226,6 +224,9 @@ def test_only_the_first_prune_counts_and_others_are_left_alone():
     notify_pruned({"means": made, "other": stock}, 20, SPARSE)
     (decay,) = made.lr_lambdas
     assert decay.pruned_at == 10
+    assert all(type(decay(step)) is float for step in (0, 7, 200)), "and no number of numpy"
+    rates(made, 5, prune_at=2)
+    assert all(type(rate) is float for rate in made.get_last_lr())
 
 
 def head_scheduler():
@@ -277,14 +278,6 @@ def test_the_rise_of_a_rate_is_limited_before_it_begins():
     schedules.limit_rise({"compensation": made}, 1)
     assert made.optimizer.param_groups[0]["lr"] == pytest.approx(1 / 5 * 1e-2)
     assert {decay.warmup_steps for decay in made.lr_lambdas} == {4}
-
-
-def test_rates_are_python_floats():
-    made = scheduler(lr_restart=1e-3)
-    for step in (0, 7, 200):
-        assert type(made.lr_lambdas[0](step)) is float
-    rates(made, 5, prune_at=2)
-    assert all(type(rate) is float for rate in made.get_last_lr())
 
 
 def trained(config, device="cpu"):
