@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 from sundae_ns.core.errors import ConfigError, DataError
-from sundae_ns.data.layouts import how_to_make_one
 
 Kind = Literal["branch", "whole"]
 """How an arm trains: from a warm-up that others share, or by itself from scratch."""
@@ -70,7 +69,7 @@ def parser_of(data: Path, downscale: int = 1) -> Words:
         return ()
     if not data.is_dir():
         raise DataError(f"{data} is no folder; give the folder of a capture")
-    raise DataError(f"{data} is no capture: it has neither sparse/0 nor transforms.json; {how_to_make_one(data)}")
+    raise DataError(f"{data} is no capture: it has neither sparse/0 nor transforms.json; make one by sundae poses")
 
 
 def plan_scene(

@@ -77,8 +77,8 @@ class Camera(NamedTuple):
             raise ConfigError(f"the focal lengths are {fx:g} and {fy:g}; give positive numbers of pixels")
         checked = numbers(pose, "pose", (3, 4), (4, 4))
         given, axes = pose if isinstance(pose, Tensor) else checked, checked[:3, :3]
-        if float((axes.T @ axes - torch.eye(3, dtype=axes.dtype, device="cpu")).abs().max()) > 0.25:
-            raise ConfigError("the first three columns of the pose are not a rotation; give unit axes at right angles")
+        if float((axes.T @ axes - torch.eye(3, dtype=axes.dtype, device="cpu")).abs().max()) > 0.25 or axes.det() < 0:
+            raise ConfigError("the first three columns of the pose are not a rotation; give right-handed unit axes")
         K = given.new_tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float32)
         return cls(world_to_camera(given[:3].float()), K, whole(width, "width"), whole(height, "height"), (fx + fy) / 2)
 
@@ -159,7 +159,7 @@ def poses_looking_at(eyes: Tensor, targets: Tensor, up: Tensor) -> Tensor:
     """Camera-to-world with OpenGL axes ``[..., 3, 4]`` of cameras at ``eyes`` that look at ``targets`` ``[..., 3]``."""
     back = torch.nn.functional.normalize(eyes - targets, dim=-1)
     right = torch.linalg.cross(up.expand_as(back), back)
-    other = torch.linalg.cross(torch.roll(back, 1, dims=-1) + back.new_tensor([1.0, 0.0, 0.0]), back)
+    other = torch.linalg.cross(torch.eye(3).to(back)[back.abs().argmin(dim=-1)], back)
     right = torch.where(right.norm(dim=-1, keepdim=True) < 1e-6, other, right)
     right = torch.nn.functional.normalize(right, dim=-1)
     return torch.stack([right, torch.linalg.cross(back, right), back, eyes], dim=-1)

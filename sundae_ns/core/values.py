@@ -50,7 +50,7 @@ def floats(values: Any, name: str, *, colors: bool = False) -> Tensor:
         return tensor
     if kind in _WHITE:
         return tensor / _WHITE[kind]
-    low, high = (float(value) for value in tensor.detach().aminmax())
+    low, high = torch.stack(tensor.detach().aminmax()).tolist()
     if not (low >= -0.1 and high <= 1.1):  # resized images may exceed their range a little
         raise DataError(f"{name} has values from {low:g} to {high:g}; give uint8, or numbers in [0, 1]")
     return tensor
@@ -90,5 +90,5 @@ def fitting() -> Iterator[None]:
             yield
     except SundaeError:
         raise
-    except (TypeError, ValueError, AttributeError, LookupError, ArithmeticError) as error:
+    except (TypeError, ValueError, AttributeError, LookupError, ArithmeticError, NotImplementedError) as error:
         raise ConfigError(f"an argument does not fit ({one_line(error)}); the docstring says what to give") from error

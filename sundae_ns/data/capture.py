@@ -58,11 +58,7 @@ def rigid(pose: np.ndarray, where: str) -> np.ndarray:
     scale = abs(float(np.linalg.det(axes))) ** (1 / 3)
     if np.abs(axes.T @ axes / scale**2 - np.eye(3)).max() > 0.1:
         raise DataError(f"{where}: transform_matrix is no camera pose, as its first three columns are not a rotation")
-    if abs(scale - 1) <= 1e-3:  # rounded numbers
-        return pose
-    pose = pose.copy()
-    pose[:3, :3] /= scale
-    return pose
+    return pose if abs(scale - 1) <= 1e-3 else np.hstack([pose[:, :3] / scale, pose[:, 3:]])  # else rounded numbers
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -79,9 +75,8 @@ def read_json(path: Path) -> dict[str, Any]:
 def check_transforms(path: Path, *, splits: Sequence[str] = ()) -> dict[str, Any]:
     """Contents of a ``transforms.json``, after a check with its lists of ``splits``; ``DataError`` names the entry."""
     meta = read_json(path)
-    frames = meta.get("frames")
-    if not isinstance(frames, list) or len(frames) < 2:
-        count = len(frames) if isinstance(frames, list) else 0
+    frames = listed if isinstance(listed := meta.get("frames"), list) else []
+    if (count := len(frames)) < 2:
         raise DataError(f"{path} lists {count} image{'s' * (count != 1)}; training needs 2 or more, with their poses")
     _check_values(meta, path.name)
     meta = with_focal_lengths(meta, path.parent)
@@ -93,13 +88,11 @@ def check_transforms(path: Path, *, splits: Sequence[str] = ()) -> dict[str, Any
         _path(frame.get("file_path"), "file_path", where)
         where += f" ({frame['file_path']!r:.80})"
         _check_values({"transform_matrix": None, **frame}, where)
-        missing = [key for key in INTRINSICS if key not in meta and key not in frame]
-        if missing:
+        if missing := [key for key in INTRINSICS if key not in meta and key not in frame]:
             raise DataError(f"{where}: {', '.join(missing)} missing; give them in each frame, or for all at the top")
         kinds[lens_of(meta, frame, where).kind] += 1
     for key in ("mask_path", "depth_file_path"):
-        count = sum(key in frame for frame in frames)
-        if count not in (0, len(frames)):
+        if (count := sum(key in frame for frame in frames)) not in (0, len(frames)):
             raise DataError(f"{path.name}: {count} of {len(frames)} frames have a {key}; give it in all or in none")
     if FISHEYE624 in kinds:  # nerfstudio makes the masks of such a lens, and reads it with no other kind
         counts = ", ".join(f"{count} images with {kind}" for kind, count in sorted(kinds.items()))
@@ -111,14 +104,12 @@ def check_transforms(path: Path, *, splits: Sequence[str] = ()) -> dict[str, Any
     listed = [split for split in ("train", "val", "test") if f"{split}_filenames" in meta]
     known = {str(Path(frame["file_path"])) for frame in frames}
     for split in splits if listed else ():
-        name = f"{split}_filenames"
-        files = meta.get(name)
+        files = meta.get(name := f"{split}_filenames")
         if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
             remedy = f"add {name} as a list of paths, or remove all such lists"
             raise DataError(f"{path.name} lists images for {', '.join(listed)}, but none for {split}; {remedy}")
-        for file in files:
-            if str(Path(file)) not in known:
-                raise DataError(f"{path.name}: {name} has {file!r:.80}, which no frame has as file_path; correct it")
+        if lost := [file for file in files if str(Path(file)) not in known]:
+            raise DataError(f"{path.name}: {name} has {lost[0]!r:.80}, which no frame has as file_path; correct it")
     return meta
 
 
@@ -142,9 +133,7 @@ _numbers = _must(
     lambda value: isinstance(value, list) and all(type(n) in (int, float) and abs(n) <= _LARGEST for n in value),
     "a list of 4, 6 or 12 finite numbers",
 )
-_radius = _must(
-    lambda value: isinstance(value, float) and 0 < value < math.inf, "a positive number of pixels with a decimal point"
-)
+_radius = _must(lambda px: isinstance(px, float) and 0 < px < math.inf, "a positive number with a decimal point")
 # The check of each entry of a file or of a frame, called with its value, its name and where it stands.
 _CHECKS: dict[str, Callable[[Any, str, str], Any]] = {
     **dict.fromkeys(("w", "h"), side),
@@ -166,8 +155,7 @@ def check_first_image(path: Path, meta: Mapping[str, Any], factor: int) -> None:
     image = path.parent / stated["file_path"]
     small = path.parent / f"images_{factor}"
     if factor == 1 or small.exists():
-        image = image if factor == 1 else small / image.name
-        if not image.exists():
+        if not (image := image if factor == 1 else small / image.name).exists():
             raise DataError(f"{image} does not exist{beside(image)}; correct file_path in {path.name}")
         return
     made = ", ".join(["1", *(entry.name[7:] for entry in entries(path.parent) if entry.name.startswith("images_"))])

@@ -17,7 +17,7 @@ from sundae_ns.core.camera import OPENGL_TO_OPENCV
 from sundae_ns.core.errors import DataError, writing
 from sundae_ns.core.files import write_text
 from sundae_ns.data.capture import read_json
-from sundae_ns.data.images import JPEG, check_image, decoded
+from sundae_ns.data.images import JPEG, check_image, decoded, decoded_mask
 from sundae_ns.data.layouts import LONGEST_SIDE
 from sundae_ns.data.photos import LEAST_PHOTOS, Photo, upright, usable
 
@@ -76,10 +76,8 @@ def names_of(photos: Sequence[Photo]) -> list[str]:
     """Paths of images in the working folder, ``c1/frame_00001.jpg``; photos of a camera and a size share a folder."""
     cameras: dict[object, int] = {}
     numbers = [cameras.setdefault((photo.size, photo.lens), len(cameras) + 1) for photo in photos]
-    return [
-        f"c{camera}/frame_{number:05d}{photo.suffix}"
-        for number, (camera, photo) in enumerate(zip(numbers, photos, strict=True), start=1)
-    ]
+    names = (f"c{camera}/frame_{number:05d}" for number, camera in enumerate(numbers, start=1))
+    return [name + photo.suffix for name, photo in zip(names, photos, strict=True)]
 
 
 def write_images(
@@ -147,7 +145,7 @@ def write_capture(
         except OSError:  # a disk without hard links
             shutil.copyfile(source, target)
         if masks:
-            mask = decoded(masks[name]).convert("L").resize(check_image(source), _NEAREST)
+            mask = decoded_mask(masks[name]).resize(check_image(source), _NEAREST)
             mask.save(out / "masks" / f"{target.stem}.png")
     write_smaller(out / "images", advance)
     if masks:
@@ -190,8 +188,7 @@ def transforms_of(model: Any, sources: Mapping[str, str], *, masked: bool = Fals
 
 
 def _intrinsics(camera: Any) -> dict[str, float]:
-    values = [float(value) for value in camera.params]
-    if len(values) == 4:  # SIMPLE_RADIAL, a special case of OPENCV
+    if len(values := [float(value) for value in camera.params]) == 4:  # SIMPLE_RADIAL, a special case of OPENCV
         values = [values[0], *values, 0.0, 0.0, 0.0]
     names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
     return {"w": int(camera.width), "h": int(camera.height), **dict(zip(names, values, strict=True))}

@@ -65,8 +65,7 @@ def read_images(model: Path) -> dict[int, ColmapImage]:
             where = f"{model / f'cameras.{kind}'}, camera {number}"
             if number in cameras:
                 raise DataError(f"{where}: it is listed twice; export it again")
-            lens = colmap_model(name, where)
-            names = COLMAP_LENSES[lens][2].split()
+            names = COLMAP_LENSES[lens := colmap_model(name, where)][2].split()
             if len(params) != len(names):
                 raise DataError(f"{where}: {lens} has {len(names)} parameters, not {len(params)}; export it again")
             for name, value in zip(names, params, strict=True):
@@ -178,7 +177,6 @@ def _rows(content: bytes, *, images: bool = False) -> list[list[str]]:
             if images:
                 next(lines, None)  # observations, which may be an empty line
     # A text cut between two lines has no other sign.
-    stated = re.search(rb"^# Number of \w+: (\d+)", content, re.MULTILINE)
-    if stated and int(stated[1]) != len(rows):
+    if (stated := re.search(rb"^# Number of \w+: (\d+)", content, re.MULTILINE)) and int(stated[1]) != len(rows):
         raise ValueError(f"it states {int(stated[1]):,} entries and has {len(rows):,}")
     return rows

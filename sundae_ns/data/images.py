@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ExifTags, Image, ImageChops, ImageCms, ImageOps
+from PIL import ExifTags, Image, ImageChops, ImageCms, ImageOps, TiffImagePlugin
 
 from sundae_ns.core.errors import DataError, reading, regular
 from sundae_ns.data.capture import beside
@@ -24,6 +24,7 @@ HEIF = (".heic", ".heif")  # for which Pillow needs the package pillow-heif
 TURNED = (5, 6, 7, 8)  # EXIF orientations that swap width and height
 JPEG: dict[str, Any] = {"quality": 97, "subsampling": 0}
 REPAIR = "repair it or remove the view"
+_TURN = "orientation of a TIFF"
 # Pillow's types of pixels that are read, and those in which their colours are converted.
 _MODES = {"CMYK": "CMYK", **dict.fromkeys(("1", "L", "LA", "I;16", "I;16B", "I;16L"), "L")}
 _MODES |= dict.fromkeys(("P", "PA", "RGB", "RGBA", "YCbCr"), "RGB")
@@ -36,6 +37,7 @@ _PRIMARIES = {9: (0.708, 0.292, 0.170, 0.797, 0.131, 0.046), 12: (0.680, 0.320, 
 _ADOBE = 563 / 256, (0.64, 0.33, 0.21, 0.71, 0.15, 0.06)  # Adobe RGB (1998), an exponent and primaries
 _WHITE = 203.0  # cd/m2, of a white sheet (Report ITU-R BT.2408); HLG is for a display of 1,000
 _KNEE = 0.46  # share of white from which a high range is rolled off
+TiffImagePlugin.READ_LIBTIFF = True  # else Pillow takes planes of 16 bits without compression for 8 bits
 
 
 def check_image(path: Path, *, mask: bool = False) -> tuple[int, int]:
@@ -57,14 +59,17 @@ def opened(path: Path) -> Image.Image:
     """An image whose header is read; that of a PNG with ``info["cicp"]``, which Pillow passes over."""
     if path.suffix.lower() in HEIF:
         reads_heif()
-    image: Image.Image = Image.open(regular(path))
+    image: Any = Image.open(regular(path))
     if image.format == "PNG":
         image.close()
         content = path.read_bytes()  # of a file, Pillow asks for as many bytes as a chunk states
         image, end = Image.open(BytesIO(content)), max(content.find(b"IDAT"), 0)
         if (at := content.find(b"\0\0\0\4cICP", 0, end)) >= 0:
             image.info["cicp"] = content[at + 8 : at + 12]
-    return image
+    elif image.format == "TIFF":  # Pillow would turn it as it is loaded
+        image.info[_TURN] = image.getexif().pop(ExifTags.Base.Orientation, 1)
+        image._size = getattr(image, "_tile_size", image.size)
+    return image  # type: ignore[no-any-return]
 
 
 @cache
@@ -83,6 +88,13 @@ def decoded(path: Path) -> Image.Image:
         return to_srgb(image)
 
 
+def decoded_mask(path: Path) -> Image.Image:
+    """A mask of type L whose pixels are 0 or 255, by half of the largest, as JPEG has no clear black."""
+    with reading(path, "a mask that can be decoded", remedy=REPAIR, missing=REPAIR), opened(path) as image:
+        grey = image.convert("L")
+    return grey.point([255 * (2 * level > int(np.asarray(grey).max())) for level in range(256)])
+
+
 def to_srgb(image: Image.Image) -> Image.Image:
     """An image of type L, RGB or RGBA in sRGB, by its ICC profile or what else states another colour space.
 
@@ -92,9 +104,12 @@ def to_srgb(image: Image.Image) -> Image.Image:
         raise DataError(f"an image has pixels of type {image.mode}; convert it to RGB")
     if is_srgb(image):
         return image
-    convert, deep = _conversion(image), image.mode.startswith("I;16")
+    convert, base = _conversion(image), image
     alpha = image.convert("RGBA").getchannel("A") if image.has_transparency_data else None
-    base = Image.fromarray(np.round(np.asarray(image) / 257).astype(np.uint8)) if deep else image
+    if image.mode.startswith("I;16"):
+        tags = getattr(image, "tag_v2", {})  # of a TIFF: its bits, which may be 12, and 0 if white is 0
+        share = np.asarray(image) / (2.0 ** tags.get(258, [16])[0] - 1)
+        base = Image.fromarray(np.round(255 * np.abs((tags.get(262) == 0) - share)).astype(np.uint8))
     base = (convert or (lambda same: same))(base.convert(_MODES[image.mode]))
     if alpha is not None:
         base = base.convert("RGB")
@@ -197,13 +212,13 @@ _LIGHT: dict[float, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
 def exif_orientation(path: Path) -> int:
     """EXIF orientation of an image, from 1 (as stored) to 8; 1 if it states none."""
     with suppress(Exception), opened(path) as image:  # decoders raise many kinds; a damaged entry is none
-        return orientation_in(image.getexif())
+        return orientation_in(image)
     return 1
 
 
-def orientation_in(exif: Image.Exif) -> int:
-    """As :func:`exif_orientation`, of EXIF data."""
-    stated = exif.get(ExifTags.Base.Orientation, 1)
+def orientation_in(image: Image.Image) -> int:
+    """As :func:`exif_orientation`, of an image."""
+    stated = image.info.get(_TURN) or image.getexif().get(ExifTags.Base.Orientation, 1)
     return stated if stated in range(1, 9) else 1
 
 
@@ -212,6 +227,7 @@ def turned(image: Image.Image, orientation: int) -> Image.Image:
     if orientation == 1:
         return image
     image = image.copy()
+    image.info.pop(_TURN, None)
     image.getexif()[ExifTags.Base.Orientation] = orientation
     return ImageOps.exif_transpose(image)
 

@@ -57,8 +57,7 @@ def posed_layout(data: Path) -> Layout | None:
     """The largest COLMAP model of a capture, or else its files of Blender; None if it has a ``transforms.json``."""
     if (data / "transforms.json").is_file():
         return None
-    models = models_in(data)
-    if models:
+    if models := models_in(data):
         return _colmap_layout(data, next(iter(models)), len(models))
     return _blender_layout(data) if (data / _BLENDER).is_file() else None
 
@@ -68,14 +67,11 @@ def _colmap_layout(data: Path, model: str, num_models: int) -> Layout:
     # Undistorted images lie beside their model.
     above = [data / model, *(folder for folder in (data / model).parents if folder.is_relative_to(data))]
     candidates = [*(folder / usual for folder in above for usual in _IMAGES), data]
-    images = next((folder for folder in candidates if (folder / names[0]).is_file()), None)
-    if images is None:
-        usual = ", ".join(_IMAGES)
-        raise DataError(f"{data} has no image {names[0]}, which its model {model} states, in {usual}; put it there")
+    if (images := next((folder for folder in candidates if (folder / names[0]).is_file()), None)) is None:
+        where = f"which its model {model} states, in {', '.join(_IMAGES)}"
+        raise DataError(f"{data} has no image {names[0]}, {where}; put it there")
     longest, downscale = max(check_image(images / names[0])), 1
-    while longest / downscale > LONGEST_SIDE:
-        if not (images.with_name(f"{images.name}_{2 * downscale}") / names[0]).is_file():
-            break
+    while longest / downscale > LONGEST_SIDE and (Path(f"{images}_{2 * downscale}") / names[0]).is_file():
         downscale *= 2
     folder = images.relative_to(data).as_posix()
     path = [] if folder == "images" else ["--images-path", folder]
@@ -90,8 +86,7 @@ def _colmap_layout(data: Path, model: str, num_models: int) -> Layout:
 def _blender_layout(data: Path) -> Layout:
     lists: list[Any] = []
     for split in ("train", "val", "test"):
-        path = data / f"transforms_{split}.json"
-        if not path.exists():
+        if not (path := data / f"transforms_{split}.json").exists():
             raise DataError(f"{path} does not exist{beside(path)}, which Blender's layout needs; copy another split's")
         frames = read_json(path).get("frames")
         named = isinstance(frames, list) and all(isinstance(frame, dict) and "file_path" in frame for frame in frames)
@@ -120,7 +115,9 @@ def no_transforms(data: Path) -> DataError:
     elif inner is not None:
         advice += f", but {inner} has; give that folder"
     else:
-        advice += f"{beside(data / 'transforms.json')}; {how_to_make_one(data)}"
+        folder = shlex.quote(f"./{data}" if str(data).startswith("-") else str(data))
+        make = f"make a capture of images with `sundae poses {folder} -o CAPTURE`"
+        advice += f"{beside(data / 'transforms.json')}; {make}"
     return DataError(advice)
 
 
@@ -150,12 +147,6 @@ def larger_model(data: Path, model: Path) -> str | None:
         return None
     more = f"{largest} has {models[largest]:,}; to train on those, give --colmap-path {largest}"
     return f"{model} has {count:,} images and {more}"
-
-
-def how_to_make_one(images: Path) -> str:
-    """Advice with the command that makes a capture of a folder of images."""
-    folder = shlex.quote(f"./{images}" if str(images).startswith("-") else str(images))
-    return f"make a capture of images with `sundae poses {folder} -o CAPTURE`"
 
 
 def unused_masks(folder: Path) -> str | None:

@@ -32,8 +32,7 @@ COLMAP_LENSES: dict[str, tuple[int, str | None, str, str]] = {
     **{name: (number, None, "", "") for name, number in {**_NO_LENSES, "EQUIRECTANGULAR": 17}.items()},
 }
 """COLMAP's camera models: number, kind (None if there is none), parameters in their order, and those that must be 0."""
-_KINDS = {name: kind for name, (_, kind, _, zeros) in COLMAP_LENSES.items() if kind and not zeros}
-_KINDS[FISHEYE624] = FISHEYE624
+_KINDS = {name: kind for name, (_, kind, _, z) in COLMAP_LENSES.items() if kind and not z} | {FISHEYE624: FISHEYE624}
 _UNDISTORT = "make undistorted images with `colmap image_undistorter`, or calibrate the capture with OPENCV"
 _ONE_EYE = "render or cut perspective images (cube faces) of one eye, each with its own pose"
 _REMEDIES = {
@@ -81,8 +80,7 @@ def lens_of(meta: Mapping[str, Any], frame: Mapping[str, Any], where: str) -> Le
     stated = {**meta, **frame}
     kind = kind_of_frame(stated, where)
     of_frame = "distortion_params" not in frame and any(key in frame for key in DISTORTION)
-    values = None if of_frame else stated.get("distortion_params")
-    if values is None:
+    if (values := None if of_frame else stated.get("distortion_params")) is None:
         values = [stated.get(key, 0.0) for key in DISTORTION] if kind != FISHEYE624 else []
     if kind != FISHEYE624 and len(values) == 4:
         if kind != FISHEYE and any(values[2:]):

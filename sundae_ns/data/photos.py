@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import filecmp
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
+from itertools import combinations, groupby
+from os.path import getsize
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,21 +47,30 @@ def find_photos(folder: Path, warn: Callable[[str], object] = str) -> list[Photo
     Hidden files and folders and those of masks are left out, and photos that cannot be read, with a line to ``warn``.
     """
     with reading(folder, "a folder of photos"):
-        paths = sorted(path for path in _files(folder) if path.suffix.lower() in SUFFIXES)
+        suffixes = [suffix for suffix in SUFFIXES if suffix not in HEIF or reads_heif()]
+        paths = sorted(path for path in _files(folder) if path.suffix.lower() in suffixes)
     counts = Counter(path.parent for path in paths)
     if len(counts) > 1 and folder not in counts:
         listed = ", ".join(f"{path.relative_to(folder)}: {count:,}" for path, count in list(counts.items())[:3])
         where = f"{folder} holds {len(paths):,} photos in {len(counts)} folders ({listed}{', ...' * (len(counts) > 3)})"
         raise DataError(f"{where}; give the folder of one scene, or move its photos into one folder")
-    if not reads_heif():
-        paths = [path for path in paths if path.suffix.lower() not in HEIF]
     if not paths:
         remark = f"({', '.join(SUFFIXES)}); give a folder of photos, or a capture"
         raise DataError(f"{folder} holds no photos that can be read: {left_out(folder) or remark}")
     if len(paths) < LEAST_PHOTOS:
         few = f"{len(paths)} photo{'s' * (len(paths) > 1)}"
         raise DataError(f"{folder} holds {few}, and camera poses need {LEAST_PHOTOS} or more that overlap; add some")
-    return list(usable(paths, photo_of, warn))
+    photos = list(usable(paths, photo_of, warn))
+    for copy, first in copies(photo.path for photo in photos).items():
+        warn(f"{copy} is a copy of {first}; remove one, as it may become a test view while the other is trained on")
+    return photos
+
+
+def copies(paths: Iterable[Path]) -> dict[Path, Path]:
+    """Files with the same bytes as an earlier one, which is the value."""
+    groups = (list(group) for _, group in groupby(sorted(paths, key=getsize), getsize))
+    pairs = (pair for group in groups for pair in combinations(group, 2))
+    return {copy: path for path, copy in pairs if filecmp.cmp(path, copy, shallow=False)}
 
 
 def usable(items: Sequence[Any], use: Callable[[Any], Any], warn: Callable[[str], object]) -> Iterator[Any]:
@@ -77,8 +89,7 @@ def usable(items: Sequence[Any], use: Callable[[Any], Any], warn: Callable[[str]
 def left_out(folder: Path) -> str | None:
     """A remark on photos of other formats in a folder; None without any."""
     unread = _OTHERS if reads_heif() else (*_OTHERS, *HEIF)
-    counts = Counter(suffix for path in _files(folder) if (suffix := path.suffix.lower()) in unread)
-    if not counts:
+    if not (counts := Counter(suffix for path in _files(folder) if (suffix := path.suffix.lower()) in unread)):
         return None
     listed = ", ".join(f"{count} {suffix}" for suffix, count in sorted(counts.items()))
     convert = "convert them to JPEG (`magick mogrify -format jpg FILES`, or export them as JPEG)"
@@ -101,7 +112,7 @@ def upright(photo: Photo) -> tuple[Image.Image, Image.Exif]:
         with opened(photo.path) as image:
             image.load()
             exif = image.getexif()
-            pixels = images.turned(images.to_srgb(image), orientation_in(exif))
+            pixels = images.turned(images.to_srgb(image), orientation_in(image))
         exif.pop(ExifTags.Base.Orientation, None)
         exif.get_ifd(ExifTags.IFD.Exif).pop(ExifTags.IFD.Interop, None)  # it may say Adobe RGB
     return pixels, exif
@@ -132,7 +143,7 @@ def photo_of(path: Path) -> Photo:
         size = check_image(path)
         with opened(path) as image:
             kind, alpha, exif = str(image.format), image.has_transparency_data, image.getexif()
-            orientation, lens, srgb = orientation_in(exif), _lens(exif), images.is_srgb(image)
+            orientation, lens, srgb = orientation_in(image), _lens(exif), images.is_srgb(image)
     if kind not in (*_COPIED, *_CONVERTED):
         raise DataError(f"{path} is a {kind} file by its contents; save it as JPEG or PNG, or remove it")
     check_shape(path, size)
@@ -158,12 +169,14 @@ def _lens(exif: Image.Exif) -> tuple[str, ...]:
 
 def masks_of(photos: Sequence[Photo], folder: Path) -> list[Path]:
     """The mask of each photo: an image in ``folder`` with its name, or with ``.png`` behind it or in its place."""
-    masks = []
+    masks, root = list[Path](), Path(os.path.commonpath([photo.path.parent for photo in photos]))
     for path, _, wanted, _, _ in photos:
         names = (path.name, f"{path.name}.png", f"{path.stem}.png", f"{path.stem}.jpg")
-        mask = next((folder / name for name in names if (folder / name).is_file()), None)
-        if mask is None:
+        tried = [place / name for place in (folder / path.parent.relative_to(root), folder) for name in names]
+        if (mask := next((each for each in tried if each.is_file()), None)) is None:
             raise DataError(f"{path} has no mask {path.stem}.png in {folder}; add it, white where pixels count")
+        if mask in masks:
+            raise DataError(f"{path} and another photo have one mask, {mask}; put masks into folders as the photos are")
         size, orientation = check_image(mask, mask=True), images.exif_orientation(path)
         # A mask of the upright size is upright; where both sizes are the same, nothing says so.
         known = orientation in TURNED and size == wanted and size != size[::-1]

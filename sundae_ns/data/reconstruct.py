@@ -235,8 +235,7 @@ def _reconstruct(work: Path, images: Path, count: int, advance: Advance) -> list
         options.num_threads, options.random_seed, options.min_model_size = threads(), 0, _LEAST_MODEL
         callbacks = {"initial_image_pair_callback": lambda: advance(2), "next_image_callback": lambda: advance(1)}
         module.incremental_mapping(database, images, partial, options, **callbacks)
-        found = _models(partial)
-        if found and (not models or len(_posed(found[0])) > 1.1 * len(_posed(models[0]))):
+        if (found := _models(partial)) and (not models or len(_posed(found[0])) > 1.1 * len(_posed(models[0]))):
             models, best = found, partial
         if models and len(_posed(models[0])) >= 0.95 * count:
             break

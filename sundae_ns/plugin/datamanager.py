@@ -25,7 +25,7 @@ from PIL import Image
 from torch import Tensor
 
 from sundae_ns.core.errors import ConfigError, DataError, SundaeError, one_line, reading
-from sundae_ns.data.images import TURNED, check_image, decoded, exif_orientation, opened, turned, wrong_size
+from sundae_ns.data.images import TURNED, check_image, decoded, decoded_mask, exif_orientation, turned, wrong_size
 from sundae_ns.data.layouts import larger_model, unused_masks
 from sundae_ns.plugin.dataparsers import check_cameras, check_capture, check_ranges, check_tests, rebound, set_parser
 from sundae_ns.train.progress import warn
@@ -93,7 +93,8 @@ class CheckedDataset(InputDataset):
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
         """Image, and mask if the capture has masks; ``DataError`` if a file of this view is damaged."""
         with reading(self.image_filenames[image_idx], "an image that can be decoded", remedy="repair or remove it"):
-            mask = rebound(get_image_mask_tensor_from_path, Image=SimpleNamespace(**{**vars(Image), "open": opened}))
+            images = SimpleNamespace(open=decoded_mask, Resampling=Image.Resampling)
+            mask = rebound(get_image_mask_tensor_from_path, Image=images)
             read = rebound(InputDataset.get_data, get_image_mask_tensor_from_path=mask)
             return cast(dict[str, Any], read(self, image_idx, image_type))
 

@@ -34,6 +34,7 @@ from sundae_ns.data.capture import check_first_image, check_transforms, read_jso
 from sundae_ns.data.colmap import ColmapImage, check_colmap, read_images, read_points
 from sundae_ns.data.layouts import no_model, no_transforms
 from sundae_ns.data.lenses import DISTORTION, INTRINSICS, KINDS, PERSPECTIVE, Lens, lens_of, with_focal_lengths
+from sundae_ns.data.photos import copies
 from sundae_ns.io.ply import read_point_cloud
 from sundae_ns.scene.load_save import FRAME_FILE
 from sundae_ns.train.progress import warn
@@ -60,8 +61,7 @@ _RANGES: dict[str, tuple[float, float, str]] = {
 def check_ranges(options: Any) -> None:
     """Raise ``ConfigError`` for the first option that is out of its range."""
     for name, (least, most, wanted) in _RANGES.items():
-        value = getattr(options, name, None)
-        if value is not None and not least <= value <= most:
+        if (value := getattr(options, name, None)) is not None and not least <= value <= most:
             raise ConfigError(f"--{name.replace('_', '-')} is {value}; give {wanted}")
 
 
@@ -75,8 +75,7 @@ def check_capture(parser: DataParserConfig, data: Path, splits: Sequence[str], *
     if not data.exists():
         raise DataError(f"{data} does not exist; give the folder of the capture with --data, or in config.yml")
     if isinstance(parser, ColmapDataParserConfig):
-        model = data / parser.colmap_path
-        if not model.is_dir():
+        if not (model := data / parser.colmap_path).is_dir():
             raise no_model(data, parser.colmap_path)
         if parser.load_3D_points and not any(model.glob("points3D.*")):
             parser.load_3D_points = False  # the model then warns, and starts from random points
@@ -361,8 +360,7 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
     if unknown.any():
         what = f"{next(compress(names, unknown)).name} is of type {CameraType(int(kinds[unknown][0])).name}"
         raise DataError(f"the camera of {what}; cut its images into perspective ones, such as cube faces")
-    mirrored = torch.linalg.det(cameras.camera_to_worlds[:, :, :3]) < 0
-    if mirrored.any():
+    if (mirrored := torch.linalg.det(cameras.camera_to_worlds[:, :, :3]) < 0).any():
         which = f"{next(compress(names, mirrored)).name} mirrors an axis ({mirrored.sum()} of {len(names)} do)"
         raise DataError(f"the pose of {which}; negate one column of its rotation")
     ratios = (cameras.fx / cameras.width.clamp_min(1)).flatten()
@@ -393,7 +391,8 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
 def check_tests(train: Any, test: Any) -> None:
     """Warn of cameras and images of a test set that stand far from all others, or are those of a training set."""
     names: Sequence[Path] = test.image_filenames
-    if shared := {*train.image_filenames} & {*names}:
+    twice = copies(path for path in dict.fromkeys([*train.image_filenames, *names]) if path.is_file())
+    if shared := {path for path in names if twice.get(path, path) in {*train.image_filenames}}:
         which = f"{min(shared).name} is a training image and a test view ({len(shared)} of {len(names)} test views are)"
         warn(f"{which}, so figures are better than those of new views; list each image once, in one split")
     centres = torch.cat([data.cameras.camera_to_worlds[:, :, 3] for data in (train, test)]).double().cpu()

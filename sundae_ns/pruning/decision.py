@@ -98,9 +98,7 @@ def decide(
     if rule.redistribution == "merge":
         assert graph is not None
         if contribution is None:
-            raise ConfigError(
-                "a merge needs a pass over the training views and there are none: set redistribution to none"
-            )
+            raise ConfigError("a merge needs a pass over the training views: give views, or set redistribution to none")
         values = merged(usable, graph, selected, contribution, labels)
     if graph is None:
         return Decision(mask, count, n - n_finite, values=values)

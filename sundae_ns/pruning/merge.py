@@ -19,9 +19,7 @@ from sundae_ns.graph.graph import NeighborGraph, build_graph
 from sundae_ns.pruning.rule import PruneRule
 
 LEAST_WIDTH = 0.25  # width added to Gaussians whose overlap is measured, in sigmas of the graph: some are flat
-MOST_UNLIKE = 8.0
-"""Largest difference of colours that counts, in typical differences. Weights fall to e^-32 and stay positive; otherwise
-a Gaussian of an extreme colour would have no neighbour and could not be merged."""
+MOST_UNLIKE = 8.0  # largest difference of colours that counts, in typical ones; no weight falls below e^-32, or to 0
 UNSEEN = 0.001  # share of all weight that is dropped, not merged: the lightest Gaussians
 FLOOR = 1e-4  # least weight in a merge, as a share of the mean: Gaussians that nothing sees merge by their likeness
 WIDTH = 0.01  # variance added to each axis, as a share of the sum of all: two parallel flat Gaussians are alike too

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from numbers import Integral, Real
 from typing import Literal, get_args, get_origin, get_type_hints
 
 from torch import Tensor
@@ -39,6 +40,10 @@ class PruneRule:
     num_neighbors: int = 16  # Most neighbours of a Gaussian in the graph
     seed: int = 0  # Seed of random draws, which are the same on every device
 
+    def __post_init__(self) -> None:
+        if type(self) is PruneRule:  # those of commands are checked later, with all else
+            self.validate()
+
     @property
     def uses_contribution(self) -> bool:
         """Whether score or merge need the blending weights over the training views."""
@@ -69,8 +74,10 @@ class PruneRule:
         for name, hint in get_type_hints(type(self)).items():
             value, kinds = getattr(self, name), (hint, *get_args(hint))
             choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
-            if choices and value not in choices and not callable(value):
-                raise ConfigError(f"{name} is {value!r}: use one of {', '.join(choices)}")
+            kind = {int: Integral, float: Real}.get(hint, object)
+            if not (value in choices or callable(value) if choices else isinstance(value, kind)):
+                wanted = f"one of {', '.join(choices)}" if choices else "a number"
+                raise ConfigError(f"{name} is {value!r}: use {wanted}")
         if not 0 <= self.gamma <= 1:
             raise ConfigError(f"gamma is {self.gamma}: use a share in [0, 1]")
         self.check_at_least(num_neighbors=1)
@@ -78,8 +85,7 @@ class PruneRule:
     def check_at_least(self, **limits: int) -> None:
         """Raise ``ConfigError`` for the first option, by name, that is set and lower than its limit."""
         for name, least in limits.items():
-            value = getattr(self, name)
-            if value is not None and value < least:
+            if (value := getattr(self, name)) is not None and value < least:
                 raise ConfigError(f"{name} is {value}: use at least {least}")
 
 

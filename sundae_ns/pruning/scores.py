@@ -36,9 +36,7 @@ def score(
     if rule.score == "response":
         return response(params, rule, graph).sqrt()
     if contribution is None:
-        raise ConfigError(
-            f"score {rule.score!r} needs a pass over the training views and there are none: use response, or a function"
-        )
+        raise ConfigError(f"score {rule.score!r} needs a pass over the training views: give views, or use response")
     return torch.nan_to_num(contribution.double(), nan=0.0)
 
 

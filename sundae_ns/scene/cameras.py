@@ -151,8 +151,7 @@ def with_start(scene: Scene, start_view: str | None, up: Sequence[float] | None)
 
     ``start_view`` is the index of a stored camera (else ``ConfigError``), or a file whose first camera it is.
     """
-    if up is not None:
-        scene = dataclasses.replace(scene, up=unit(up))
+    scene = scene if up is None else dataclasses.replace(scene, up=unit(up))
     if start_view is None:
         return scene
     if not start_view.lstrip("-").isdigit():

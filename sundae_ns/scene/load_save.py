@@ -69,8 +69,7 @@ def load_with_mask(path: Path, device: torch.device | str = "cpu") -> tuple[Scen
             packed.write_bytes(packed_in(path))
             return load_with_mask(packed, device)
     if formats.kind_of_gaussians(path) is None:
-        config = find_config(path)
-        if config is None:
+        if (config := find_config(path)) is None:
             reason = "is no run" if path.exists() else "does not exist"
             wanted = "give a run, its config.yml, or a .sundae, .ply, .spz, .sog, .glb, .splat, .ksplat or .pt file"
             raise CheckpointError(f"{path} {formats.unread(path) or f'{reason}; {wanted}'}")

@@ -20,7 +20,7 @@ from sundae_ns.core.gaussians import FEATURES, MAX_SH_DEGREE, Gaussians, checked
 from sundae_ns.core.metrics import Quality, evaluate
 from sundae_ns.core.values import AnyArray, fitting, floats, numbers, positions, whole
 from sundae_ns.cuda.kernels import naming_full_memory
-from sundae_ns.data.images import to_srgb
+from sundae_ns.data.images import orientation_in, to_srgb, turned
 from sundae_ns.data.photos import photo_of, upright
 from sundae_ns.graph.neighbors import knn
 from sundae_ns.head.head import CompensationHead
@@ -121,10 +121,11 @@ class Scene:
         harmonics = rgb_to_sh(harmonics)[:, None] if harmonics.ndim == 2 else harmonics
         if harmonics.ndim != 3:
             raise DataError(f"colors has shape {list(harmonics.shape)}; it must be [N, 3] or [N, (degree + 1)^2, 3]")
-        deviations, alphas = floats(scales, "scales"), floats(opacities, "opacities")
+        deviations, alphas, turns = floats(scales, "scales"), floats(opacities, "opacities"), floats(quats, "quats")
         if bool((deviations < 0).any()) or bool(((alphas - 0.5).abs() > 0.5).any()):
             raise DataError("scales are negative or opacities beyond [0, 1]; give neither logarithms nor logits")
-        params = {"means": means, "scales": deviations.log(), "quats": quats, "opacities": alphas.logit().view(-1, 1)}
+        turns = turns / turns.abs().amax(dim=-1, keepdim=True).clamp_min(1e-38)  # their squares are normal float32
+        params = {"means": means, "scales": deviations.log(), "quats": turns, "opacities": alphas.logit().view(-1, 1)}
         return cls(Gaussians({**params, "features_dc": harmonics[:, 0], "features_rest": harmonics[:, 1:]}))
 
     @property
@@ -281,10 +282,10 @@ def usable_cameras(cameras: Any) -> tuple[Camera, ...]:
     for camera in listed:
         if not isinstance(camera, Camera):
             raise DataError(f"{str(camera)[:80]!r} is no camera; give a Camera, or those of cameras_of(path)")
-        for matrix in camera[:2]:
-            # Not on a GPU, which would be waited for.
-            if not isinstance(matrix, Tensor) or (matrix.device.type == "cpu" and not bool(matrix.isfinite().all())):
-                raise DataError("the matrices of a camera are no finite tensors; make it by Camera.from_pose")
+        for matrix, side in zip(camera[:2], (4, 3), strict=True):  # on a GPU, values would be waited for
+            fits = isinstance(matrix, Tensor) and matrix.shape == (side, side) and matrix.dtype == torch.float32
+            if not fits or (matrix.device.type == "cpu" and not bool(matrix.isfinite().all())):
+                raise DataError("the matrices of a camera are no finite tensors, float32; make it by Camera.from_pose")
     return listed
 
 
@@ -394,5 +395,6 @@ def _image(image: Any, name: str) -> Tensor:
     """An image of a caller, in [0, 1] ``[H, W, 3]``."""
     image = upright(photo_of(Path(image)))[0] if isinstance(image, (str, Path)) else image
     if isinstance(image, Image.Image):
-        image = np.asarray(image if image.mode == "RGBA" else to_srgb(image).convert("RGB"))
+        shown = image if image.mode == "RGBA" else to_srgb(image).convert("RGB")
+        image = np.asarray(turned(shown, orientation_in(image)))
     return floats(image.rgb if isinstance(image, Rendering) else image, name, colors=True)

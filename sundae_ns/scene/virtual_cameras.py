@@ -157,8 +157,7 @@ def resized(gaussians: Gaussians, factor: float) -> Gaussians:
 
 def usable(scene: Scene) -> Gaussians:
     """The finite Gaussians, detached."""
-    gaussians = sanitise(scene.gaussians).gaussians
-    if not gaussians.num_gaussians:
+    if not (gaussians := sanitise(scene.gaussians).gaussians).num_gaussians:
         raise DataError(f"none of {scene.num_gaussians:,} Gaussians is finite, so no camera sees the scene")
     return Gaussians({name: value.detach() for name, value in gaussians.items()}, gaussians.encoding)
 

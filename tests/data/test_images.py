@@ -5,11 +5,22 @@ import zlib
 
 import numpy as np
 import pytest
+import tifffile
 from icc_profiles import SPACES, judged, profile
 from limits import verdict
+from photos import photo
 from PIL import Image, ImageCms
 
-from sundae_ns.data.images import decoded, opened, reads_heif, to_srgb, to_srgb_values
+from sundae_ns.data.images import (
+    check_image,
+    decoded,
+    decoded_mask,
+    exif_orientation,
+    opened,
+    reads_heif,
+    to_srgb,
+    to_srgb_values,
+)
 from sundae_ns.data.photos import photo_of, upright
 
 
@@ -138,14 +149,31 @@ def grey16(path):
     Image.fromarray(np.asarray(patches().convert("L"), np.uint16) * 257).save(path)
 
 
+def grey12(path):
+    """A TIFF, which Pillow does not write."""
+    bits = np.round(GREY[..., :1] / 255 * 4095).astype(int) >> np.arange(11, -1, -1) & 1
+    pixels = np.packbits(bits.astype(np.uint8)).tobytes()
+    tags = {256: 192, 257: 128, 258: 12, 259: 1, 262: 1, 273: 110, 277: 1, 279: len(pixels)}
+    table = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags.items())
+    path.write_bytes(struct.pack("<2sHIH", b"II", 42, 8, len(tags)) + table.ljust(100, b"\0") + pixels)
+
+
+def in_planes(path):
+    tifffile.imwrite(path, SAME.transpose(2, 0, 1).astype(np.uint16) * 257, photometric="rgb", planarconfig="separate")
+
+
 def with_profile(mode, space):
     icc = space if isinstance(space, bytes) else profile(space)
     return lambda path: patches().convert(mode).save(path, icc_profile=icc)
 
 
 GREY = np.asarray(patches().convert("L").convert("RGB"), int)
+GREY16 = GREY[..., 0].astype(np.uint16)
 TYPES = {
     "16 bits": (grey16, "L", GREY),
+    "12 bits": (grey12, "L", GREY),
+    "16 bits in planes": (in_planes, "RGB", SAME),
+    "white is 0": (lambda path: tifffile.imwrite(path, 65535 - 257 * GREY16, photometric="miniswhite"), "L", GREY),
     "a palette": (lambda path: patches().quantize(64).save(path), "RGB", SAME),
     "grey and alpha": (lambda path: patches().convert("LA").save(path), "RGBA", GREY),
     "CMYK": (lambda path: patches().convert("CMYK").save(path, format="TIFF"), "RGB", SAME),
@@ -163,6 +191,25 @@ def test_types_of_pixels(tmp_path, make, mode, expected):
     image = decoded(tmp_path / "a.png")
     assert image.mode == mode
     assert off(image, expected) <= 1
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("name", ["a.png", "a.tif"])
+def test_pixels_and_sizes_are_those_that_are_stored(tmp_path, name, orientation):
+    """Pillow turns those of TIFF alone."""
+    photo(tmp_path / name, image=patches(), orientation=orientation)
+    assert (check_image(tmp_path / name), exif_orientation(tmp_path / name)) == ((192, 128), orientation)
+    assert np.array_equal(decoded(tmp_path / name), SAME)
+    found = photo_of(tmp_path / name)
+    assert upright(found)[0].size == found.size == ((128, 192) if orientation > 4 else (192, 128))
+
+
+@pytest.mark.parametrize(("name", "white"), [("a.jpg", 255), ("a.png", 1), ("a.png", 255)])
+def test_masks_are_black_and_white(tmp_path, name, white):
+    mask = np.zeros((40, 60), np.uint8)
+    mask[9:27, 13:49] = white
+    Image.fromarray(mask).save(tmp_path / name, quality=80)
+    assert np.array_equal(decoded_mask(tmp_path / name), mask.astype(bool) * 255)
 
 
 def test_srgb_stays_as_it_is(tmp_path):

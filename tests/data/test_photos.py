@@ -57,6 +57,14 @@ def zipped_text(path):
     path.write_bytes(content[:-12] + chunk + content[-12:])
 
 
+def test_copies_are_named(photos):
+    said = []
+    (photos / "0 again.png").write_bytes((photos / "0.png").read_bytes())
+    assert len(find_photos(photos, said.append)) == 4
+    (line,) = said
+    assert line.startswith(f"{photos}/0.png is a copy of {photos}/0 again.png; remove one")
+
+
 ODD = {
     "a pipe": (os.mkfifo, "it is a pipe or a device"),
     "a raw pipe": (lambda path: os.mkfifo(path.with_suffix(".cr2")), "it is a pipe or a device"),
@@ -146,6 +154,15 @@ def test_the_mask_of_a_photo_has_its_upright_size(tmp_path, name, orientation, s
     path = photo(tmp_path / "photos" / "a.jpg", "jpeg", orientation=orientation)
     mask = photo(tmp_path / "masks" / name, mode="L", size=size)
     assert masks_of([photo_of(path)], mask.parent) == [mask]
+
+
+def test_masks_lie_in_folders_as_their_photos_do(tmp_path):
+    found = [photo_of(photo(tmp_path / "photos" / folder / "0.jpg")) for folder in "ab"]
+    photo(tmp_path / "masks" / "0.png", mode="L")
+    with pytest.raises(DataError, match=r"b/0\.jpg and another photo have one mask, .*/masks/0\.png; put masks"):
+        masks_of(found, tmp_path / "masks")
+    masks = [photo(tmp_path / "masks" / folder / "0.png", mode="L") for folder in "ab"]
+    assert masks_of(found, tmp_path / "masks") == masks
 
 
 MASKS = {

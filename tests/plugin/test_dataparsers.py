@@ -128,6 +128,11 @@ def test_a_test_view_that_is_trained_on_is_named(capture, load, edit, capsys):
     edit(capture, val_filenames=[name], test_filenames=[name])
     load(capture)
     assert f"{Path(name).name} is a training image and a test view (1 of 1 test views are)" in said(capsys)
+    copy = meta_of(capture)["train_filenames"][-1]
+    (capture / copy).write_bytes((capture / name).read_bytes())
+    edit(capture, train_filenames=meta_of(capture)["train_filenames"][:-1], val_filenames=[copy], test_filenames=[copy])
+    load(capture)
+    assert f"{Path(copy).name} is a training image and a test view (1 of 1 test views are)" in said(capsys)
 
 
 def test_a_stray_test_view_is_named(capture, load, edit, capsys):

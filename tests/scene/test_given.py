@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from fields import random_field
+from photos import photo
 from PIL import Image
 from short_prunes import short_prunes  # noqa: F401
 
@@ -69,7 +70,10 @@ def test_images_of_every_type(tmp_path):
     expected = sn.measure(SCENE, [torch.from_numpy(stored / np.float32(255))], [CAMERA])
     assert 55 < expected.psnr < 75  # the rounding
     arrays = [stored, torch.from_numpy(stored), stored[None], stored.astype(np.uint16) * 257]
-    for form in [*arrays, Image.fromarray(stored), path, str(path)]:
+    upside_down = [tmp_path / "b.png", tmp_path / "b.tif"]
+    for each in upside_down:
+        photo(each, image=Image.fromarray(stored[::-1, ::-1]), orientation=3)
+    for form in [*arrays, Image.fromarray(stored), path, str(path), *upside_down, *map(Image.open, upside_down)]:
         for images in (form, form if np.ndim(form) == 4 else [form]):
             found = sn.measure(SCENE, images, CAMERA)
             assert (found.psnr, found.ssim) == pytest.approx((expected.psnr, expected.ssim), abs=1e-3)
@@ -85,11 +89,17 @@ def test_cameras_and_numbers_of_every_type():
         assert (camera.width, camera.height) == (24, 20)
     assert sn.prune(SCENE, count=np.int64(50), cameras=CAMERA).num_gaussians == 50
     assert sn.crop(SCENE, np.zeros(3), torch.ones(3)).num_gaussians == 100
-    arrays = {name: value.double().numpy() for name, value in SCENE.gaussians.items()}
-    made = sn.Scene(arrays, cameras=[CAMERA], up=np.array([0, -2.0, 0]))
+    params = {name: value.double().numpy() for name, value in SCENE.gaussians.items()}
+    made = sn.Scene(params, cameras=[CAMERA], up=np.array([0, -2.0, 0]))
     assert torch.equal(sn.render(made, CAMERA).rgb, sn.render(SCENE, CAMERA).rgb)
     assert (made.cameras, made.up) == ((CAMERA,), (0, -1, 0))
     assert dataclasses.replace(made, antialiased=True).gaussians is made.gaussians
+    turns = np.random.default_rng(0).normal(size=(100, 4))
+    for factor in (1e-30, 1e30):
+        torch.testing.assert_close(arrays(quats=factor * turns).quats, arrays(quats=turns).quats)
+    for eye in ((0, 0, 2), (0, 0, -2), (-2, 0, 0)):
+        rotation = look_at(eye, (0, 0, 0), eye).viewmat[:3, :3]
+        torch.testing.assert_close(rotation @ rotation.T, torch.eye(3))
     opaque = scene(opacities=torch.full((9, 1), torch.inf), scales=torch.full((9, 3), -torch.inf))
     assert opaque.num_gaussians == 9
 
@@ -127,9 +137,11 @@ REFUSED = {
     "size inf": (lambda: look_at((0, 0, 1), (0, 0, 0), width=np.inf), "width is inf"),
     "fov": (lambda: look_at((0, 0, 1), (0, 0, 0), fov=180), "fov is 180"),
     "scaled pose": (lambda: sn.Camera.from_pose(2 * EYE, (1, 1, 1, 1), 2, 2), "not a rotation"),
+    "mirrored pose": (lambda: sn.Camera.from_pose(EYE * [-1, 1, 1, 1], (1, 1, 1, 1), 2, 2), "not a rotation"),
     "focal": (lambda: sn.Camera.from_pose(EYE, (0, 1, 1, 1), 2, 2), "focal lengths are 0 and 1"),
     "a matrix": (lambda: sn.render(SCENE, EYE), "is no camera"),
     "NaN matrix": (lambda: sn.render(SCENE, CAMERA._replace(K=CAMERA.K * np.nan)), "no finite tensors"),
+    "matrices": (lambda: sn.render(SCENE, CAMERA._replace(viewmat=CAMERA.viewmat[None])), "no finite tensors"),
     "array": (lambda: sn.render(SCENE, CAMERA._replace(K=np.eye(3))), "no finite tensors"),
     "path": (lambda: sn.prune(SCENE, keep=0.5, cameras="a.json"), "'a.json' is no camera"),
     "share": (lambda: sn.prune(SCENE, keep="0.1"), "keep is not made of 1 finite number"),
@@ -159,6 +171,8 @@ REFUSED = {
     "one row": (lambda: SCENE[3], r"rows are int64 \[\]"),
     "beyond": (lambda: SCENE[[0, 100]], "from 0 to 99"),
     "no rows": (lambda: SCENE[5:5], r"rows are int64 \[0\]"),
+    "sparse": (lambda: arrays(colors=torch.from_numpy(POINTS).to_sparse()), "an argument does not fit"),
+    "meta": (lambda: arrays(colors=torch.zeros(100, 3, device="meta")), "an argument does not fit"),
     "logits": (lambda: arrays(opacities=np.full(100, 2.0)), "give neither logarithms nor logits"),
     "logarithms": (lambda: arrays(scales=np.log(POINTS)), "give neither logarithms nor logits"),
     "channels": (lambda: arrays(colors=POINTS[:, 0]), r"colors has shape \[100\]; it must be"),
@@ -194,6 +208,9 @@ def test_the_rule_of_a_prune_is_that_of_the_command():
     from sundae_ns.cli.prune import RuleOptions
 
     assert vars(sn.PruneRule()) == vars(RuleOptions())
+    for wrong in ("gamma", "num_neighbors", "seed"):
+        with pytest.raises(sn.SundaeError, match=f"{wrong} is None: use a number"):
+            sn.PruneRule(**{wrong: None})
 
 
 def test_huge_cameras_score_at_a_smaller_size(monkeypatch):

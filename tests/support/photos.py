@@ -1,4 +1,4 @@
-"""Files of photos, grey unless an image is given."""
+"""Files of photos, of one colour, which their names give, unless an image is given."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ def photo(
     exif.update({ORIENTATION: orientation} | ({MODEL: model} if model else {}))
     if focal is not None:
         exif.get_ifd(EXIF)[FOCAL] = focal
-    (image or Image.new(mode, size, "grey" if mode == "RGB" else 0)).save(path, format=kind, exif=exif.tobytes())
+    colour = (31 * sum(path.name.encode()) % 256, 128, 128) if mode == "RGB" else 0
+    (image or Image.new(mode, size, colour)).save(path, format=kind, exif=exif.tobytes())
     return path
 
 
