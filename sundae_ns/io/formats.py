@@ -67,8 +67,7 @@ def kind_of_gaussians(path: Path) -> Kind | None:
     """
     if path.name in METAS or (any((path / name).is_file() for name in METAS) and not (path / "config.yml").exists()):
         return "sog"
-    kind = kind_of(path)
-    if kind is None and not path.is_dir():
+    if (kind := kind_of(path)) is None and not path.is_dir():
         kind = _BY_SUFFIX.get(path.suffix.lower())
     return kind if kind in PRIMITIVES else None
 
@@ -81,15 +80,14 @@ def unread(path: Path) -> str | None:
     """
     if path.is_dir():
         # The folder of a training by the authors of 3DGS.
-        clouds = sorted(path.glob("point_cloud/iteration_*/point_cloud.ply"), key=lambda each: each.stat().st_mtime)
+        clouds = sorted(path.glob("point_cloud/iteration_*/point_cloud.ply"), key=lambda each: (len(str(each)), each))
         return f"is a folder of 3DGS; give {clouds[-1]}" if clouds else None
     return _UNREAD.get(path.suffix.lower())
 
 
 def refuse(path: Path, *, packed: str | None = None, primitives: str | None = None) -> None:
     """Raise ``CheckpointError`` for a packed scene or a file of Gaussians, with the advice for it; None accepts it."""
-    kind = kind_of(path)
-    if kind == "packed" and packed is not None:
+    if (kind := kind_of(path)) == "packed" and packed is not None:
         raise CheckpointError(f"{path} is a packed scene; {packed}")
     if kind in PRIMITIVES and primitives is not None:
         raise CheckpointError(f"{path} is a {PRIMITIVES[kind]}; {primitives}")

@@ -307,8 +307,7 @@ def read_ply(path: Path) -> dict[str, Tensor]:
     """
     file = _Ply(path)
     rows = file.rows()
-    present = set(rows.dtype.names or ())
-    if present.issuperset(_PACKED):
+    if (present := set(rows.dtype.names or ())).issuperset(_PACKED):
         with reading(path, "a complete compressed .ply"):
             return _decompressed(file.rows("chunk"), rows, file.rows("sh") if "sh" in file.elements else None)
     columns = dict(_COLUMNS)
@@ -417,8 +416,7 @@ def read_point_cloud(path: Path, *, precise: bool = False) -> tuple[Tensor, Tens
     if not names >= {"x", "y", "z"}:
         raise DataError(f"{path} has vertices without x, y and z; give a .ply of points.")
     points = _columns(rows, "xyz", np.float64 if precise else np.float32)
-    channels = next((channels for channels in _CLOUD_COLORS if names >= set(channels)), None)
-    if channels is None:
+    if (channels := next((channels for channels in _CLOUD_COLORS if names >= set(channels)), None)) is None:
         return points, torch.full((len(points), 3), 128, dtype=torch.uint8)
     colors = _columns(rows, channels)
     if channels == _COLUMNS["features_dc"]:

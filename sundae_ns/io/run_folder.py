@@ -10,6 +10,7 @@ training.lock        names the process that trains here, which holds its lock
 from __future__ import annotations
 
 import json
+import logging
 import os
 import socket
 from contextlib import suppress
@@ -24,6 +25,7 @@ from sundae_ns.io.config_file import capture_and_source, config_of, schedule_len
 
 LOCK = "training.lock"
 PRUNES = "prune.json"  # record of the prunes, which a resumed run does not repeat
+_log = logging.getLogger(__name__)
 _held: dict[Path, TextIO] = {}
 
 
@@ -46,8 +48,7 @@ def reserve(run: Path, busy: str = "trains in {}; wait for it, or give another -
     Returns the descriptor of the locked file; the lock lasts while a process has it open. ``StorageError`` if another
     process, whose name stands before the words ``busy``, has reserved the folder ``{}``, or it cannot be written.
     """
-    run = run.resolve()
-    if run in _held:
+    if (run := run.resolve()) in _held:
         return _held[run].fileno()
     with writing(f"cannot write to the run's folder {run}"):
         run.mkdir(parents=True, exist_ok=True)
@@ -139,4 +140,7 @@ def unfinished_run(out: Path, method: str, capture: Path) -> tuple[Path, int, in
             length = schedule_length(path)
             candidates.append((path.stat().st_mtime, (folder, length - left, length)))
     runs = [run for _, run in sorted(candidates) if run[0].resolve() not in resumed]
+    if len(runs) > 1:  # a clock that was wrong tells the order wrongly
+        which = f"{runs[-1][0]} is the newest of {len(runs)} unfinished runs by their dates"
+        _log.warning("%s; to resume another, add -- --load-dir RUN/nerfstudio_models", which)
     return runs[-1] if runs else None

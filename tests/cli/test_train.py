@@ -93,6 +93,9 @@ def test_an_unfinished_run_is_named_and_resumed(commands, capsys):
     assert config.load_dir == Path("outputs/my scene/sundae/first/nerfstudio_models")
     assert (config.experiment_name, config.timestamp, config.vis) == ("my scene", "first", "tensorboard")
     assert not capsys.readouterr().out.startswith("#")
+    write_run(Path("outputs", "my scene", "sundae", "second"), 999, 30000, capture=Path("my scene"))
+    assert train("my scene", "--resume") == 0
+    assert "sundae/second is the newest of 2 unfinished runs by their dates; to resume" in capsys.readouterr().out
     # Another method or folder has no such run.
     for more in (["--method", "sundae-tiny"], ["-o", "elsewhere"]):
         assert "no unfinished run" in command_line.refusal(capsys, "train", "my scene", "--resume", *more)
