@@ -159,7 +159,7 @@ def poses_looking_at(eyes: Tensor, targets: Tensor, up: Tensor) -> Tensor:
     """Camera-to-world with OpenGL axes ``[..., 3, 4]`` of cameras at ``eyes`` that look at ``targets`` ``[..., 3]``."""
     back = torch.nn.functional.normalize(eyes - targets, dim=-1)
     right = torch.linalg.cross(up.expand_as(back), back)
-    other = torch.linalg.cross(torch.eye(3).to(back)[back.abs().argmin(dim=-1)], back)
+    other = torch.linalg.cross(torch.nn.functional.one_hot(back.abs().argmin(dim=-1), 3).to(back), back)
     right = torch.where(right.norm(dim=-1, keepdim=True) < 1e-6, other, right)
     right = torch.nn.functional.normalize(right, dim=-1)
     return torch.stack([right, torch.linalg.cross(back, right), back, eyes], dim=-1)

@@ -32,7 +32,7 @@ from small_captures import meta_of
 import sundae_ns as sn
 from sundae_ns.core.errors import PackError, SundaeError
 from sundae_ns.core.gaussians import Gaussians
-from sundae_ns.data.images import reads_heif
+from sundae_ns.data.images import decoded_mask, reads_heif
 from sundae_ns.data.photos import photo_of, upright
 from sundae_ns.data.video import check_video, write_frames
 from sundae_ns.io import checkpoint
@@ -105,7 +105,7 @@ READERS = {
     "page.html": (lambda path: sn.save(sn.Scene(Gaussians(small_field(20))), path), sn.load),
     "path.json": (write_path, sn.cameras_of),
     **{
-        f"0.{kind}": (write_photo, lambda path: upright(photo_of(path)))
+        f"0.{kind}": (write_photo, lambda path: (upright(photo_of(path)), decoded_mask(path)))
         for kind in ("jpg", "png", "tif", "webp", "bmp", "heic")
     },
     **{f"a.{kind}": (write_clip, read_video) for kind in ("mp4", "mkv", "avi")},
