@@ -10,6 +10,7 @@ H=$PWD R=/tmp/repo J=/tmp/jobs
 export PYTHONPATH=/opt/site PATH=/opt/site/bin:$PATH OMP_NUM_THREADS=4 NUMBA_NUM_THREADS=4 PYTHONUNBUFFERED=1 PYTHONWARNINGS=ignore
 export SLOTS=${SLOTS:-1} GPUS=${GPUS:-2} RESERVED= R
 for c in .gpu/p*/scenes/*; do [ -d $c ] && mkdir -p /tmp/scenes && cp -r $c /tmp/scenes/; done
+[ -d .gpu/cuts ] && python3 lab/uncut.py unpack .gpu/cuts /tmp/scenes
 case $1 in
   setup)
     bash .gpu/setup.sh > /tmp/setup.log 2>&1; tail -n 1 /tmp/setup.log; python3 lab/console_scripts.py

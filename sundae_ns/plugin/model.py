@@ -72,10 +72,9 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """Weight of the loss on the image without the head, which keeps exported .ply files valid."""
     loss_after_prune: Literal["l1", "rms"] = "rms"
     """Term beside SSIM: l1 is the paper's; rms, the root of the mean squared error, gains 0.1 to 0.3 dB."""
-    prior_after_prune: float = 0.3
-    """Weight of opacities and scales in the loss of the pruned field, over the number of training images."""
-    average_share: float = 0.1
-    """The run ends with the mean of the weights over this last share of its schedule; 0.1 gains 0.2 dB."""
+    prior_after_prune: float = 0.3  # Weight of opacities and scales in the loss once pruned, over the number of images
+    average_share: float = 0.1  # Last share of the schedule over which weights are averaged; 0.1 gains 0.2 dB
+    drop_rate: float = 0.0  # Share of the Gaussians that a step leaves out at random; 0.2 suits few photos in one light
     exposure_compensation: Literal["auto", "on", "off"] = "auto"
     """Even out photos of changing exposure or white balance with their neighbours; auto does if half of them differ."""
     dense_start_views: int = 300
@@ -213,7 +212,8 @@ class SundaeModel(SplatfactoModel):
     def render_settings(self, *, training: bool) -> RenderSettings:
         """Settings of images at this step."""
         antialiased, absgrad = self.config.rasterize_mode == "antialiased", self.config.use_absgrad
-        return self.state.render_settings(self.backend, antialiased=antialiased, training=training, absgrad=absgrad)
+        settings = self.state.render_settings(self.backend, antialiased=antialiased, training=training, absgrad=absgrad)
+        return replace(settings, drop_rate=self.config.drop_rate * training)
 
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> MutableMapping[str, Any]:  # type: ignore[override]

@@ -42,10 +42,9 @@ class RenderSettings:
     backend: Backend
     active_sh_degree: int = MAX_SH_DEGREE  # Highest SH degree in use, at most that of the Gaussians
     fixed_harmonics: bool = False  # Whether the harmonics beyond the base colour get no gradient
-    antialiased: bool = False
-    """Whether opacities compensate for the smallest footprint (``rasterize_mode`` of splatfacto)."""
-    training: bool = False
-    """Whether gradients are needed. Images are then not clamped, and the head runs at their scale."""
+    antialiased: bool = False  # Whether opacities compensate for the smallest footprint (splatfacto's rasterize_mode)
+    training: bool = False  # Whether gradients are needed: images are not clamped, and the head runs at their scale
+    drop_rate: float = 0.0  # Share of the Gaussians that are left out at random
     absgrad: bool = False  # Whether to sum absolute gradients of the projected centres
     head: CompensationHead | None = None  # The head; None while it is disabled
     trained_focal: tuple[float, float] | None = None  # Shortest and longest focal length of the head's images, pixels
@@ -91,10 +90,11 @@ def pass_inputs(
     **options: Any,
 ) -> Inputs:
     """Arguments of a splatting pass: activated parameters, channels ``[N, C]`` or 1, camera, settings and options."""
-    means = params["means"]
-    colors = torch.ones_like(means[:, :1]) if channels is None else channels
+    colors = torch.ones_like(params["means"][:, :1]) if channels is None else channels
     opacities = params["opacities"].sigmoid().squeeze(-1)
-    splats = (means, params["quats"], params["scales"].exp(), opacities, colors)
+    if settings.drop_rate > 0:  # The others make up for them (Park et al., "DropGaussian", 2025)
+        opacities = torch.nn.functional.dropout(opacities, settings.drop_rate).clamp(max=1)
+    splats = (params["means"], params["quats"], params["scales"].exp(), opacities, colors)
     return Inputs(*splats, camera, near_plane=NEAR_PLANE, antialiased=settings.antialiased, **options)
 
 

@@ -29,6 +29,7 @@ def check(options: Any) -> None:
         ("prior-after-prune", math.inf, "0 or more"),
         ("dense-start-views", math.inf, "a number of images, 0 for no sweep"),
         ("average-share", 1, "a share of the schedule, 0.1 for the last tenth"),
+        ("drop-rate", 0.9, "a share of the Gaussians, 0.2 for few photos"),
     ):
         value = getattr(options, name.replace("-", "_"))
         if not 0 <= value <= most:

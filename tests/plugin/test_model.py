@@ -33,6 +33,7 @@ def test_it_is_a_splatfacto_whose_groups_have_features_and_head(build):
         ({"head": {"num_features": 0}}, "num-features"),
         ({"base_loss_weight": -1.0}, "base-loss-weight is -1.0; give 0 or more"),
         ({"average_share": 1.5}, "average-share is 1.5; give a share"),
+        ({"drop_rate": 1.0}, "drop-rate is 1.0; give a share of the Gaussians"),
         ({"prior_after_prune": float("nan")}, "prior-after-prune is nan"),
         ({"use_bilateral_grid": True}, "no bilateral grid"),
     ],

@@ -11,7 +11,7 @@ from nerfstudio.data.scene_box import OrientedBox
 from sundae_ns.core.errors import MemoryExhaustedError
 from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.head.head import resize
-from sundae_ns.scene.render import GaussianSource, render_view
+from sundae_ns.scene.render import GaussianSource, pass_inputs, render_view
 
 N = 60  # Gaussians of a model that is built without a count
 VIEWER_KEYS = {"rgb": 3, "base_rgb": 3, "depth": 1, "accumulation": 1, "features": 3, "response": 1, "background": 3}
@@ -184,3 +184,12 @@ def test_one_primitive_has_no_response_to_show_and_few_have_one(build, camera, n
     picture = build(n=n).eval().get_outputs_for_camera(camera())["response"]
     assert picture.isfinite().all()
     assert bool(picture.any()) == (n > 1)
+
+
+def test_a_training_image_leaves_out_some_and_a_shown_one_none(build):
+    model = build(n=4000, drop_rate=0.2)
+    settings, params = (model.render_settings(training=on) for on in (True, False)), model.state.gaussians
+    dropped, whole = (pass_inputs(params, None, each).opacities for each in settings)
+    assert torch.equal(whole, params["opacities"].sigmoid().squeeze(1))
+    assert 0.16 < (dropped == 0).float().mean() < 0.24  # six deviations
+    torch.testing.assert_close(dropped[dropped > 0], (whole / 0.8).clamp(max=1)[dropped > 0])

@@ -67,7 +67,7 @@ GROWTH = {
     [
         GROWTH,
         {**GROWTH, "use_absgrad": True},
-        {"pruning": {"mode": "off"}, "head": {"mode": "off"}},
+        {"pruning": {"mode": "off"}, "head": {"mode": "off"}, "drop_rate": 0.2},
         {"sh_degree": 0, "head": {"mode": "features"}},
     ],
     ids=["densify", "absgrad", "no-head", "logits"],
