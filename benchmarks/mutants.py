@@ -47,7 +47,7 @@ SECONDS = 120
 """A changed module counts as noticed if its tests take longer than this: they hang."""
 # Modules below the package, and tests that should notice a change in them; that named like the module runs first.
 ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "pruning": (("pruning/[!_]*.py",), ("pruning/test_*.py", "train/test_schedules.py")),
+    "pruning": (("pruning/[!_]*.py",), ("pruning/test_*.py", "scene/test_cleaning.py")),
     "schedules": (
         ("train/pruning.py", "train/choice.py"),
         ("train/test_pruning.py", "train/test_schedules.py", "train/test_choice.py", "train/test_golden_trials.py"),

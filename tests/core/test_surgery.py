@@ -162,6 +162,7 @@ def test_a_network_is_restored_in_place():
             net(torch.ones(2, 3)).square().sum().backward()
             optimizer.step()
 
+    fresh = module_snapshot(net.parameters(), optimizer)
     steps(3)
     saved, objects = module_snapshot(net.parameters(), optimizer), list(net.parameters())
     steps(4)
@@ -171,6 +172,8 @@ def test_a_network_is_restored_in_place():
     assert all(a is b for a, b in zip(objects, net.parameters()))
     steps(4)
     assert all(torch.equal(a, b) for a, b in zip(expected, net.parameters()))
+    restore_module(net.parameters(), optimizer, fresh)
+    assert not optimizer.state, "before the first step there are no moments"
 
 
 def integral(opacity, scale, copies):
@@ -196,6 +199,7 @@ def test_copies_render_like_the_original(opacity):
 def test_growing_adds_the_exact_number_upon_the_most_opaque(count):
     params, optimizers = gaussians(30)
     train(params, optimizers)
+    params["opacities"].data[7] = 40.0  # 1 in float32, whose logit is infinite
     old, before = params["means"].detach().clone(), moments(optimizers, params, "features").clone()
     opaque = params["opacities"].detach().flatten().argsort(descending=True)
     grow(params, optimizers, count, 0.005)

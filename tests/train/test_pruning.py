@@ -1,5 +1,6 @@
 """Pruning in training: options, steps around a prune, reports, warnings, and floaters."""
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -273,6 +274,9 @@ def test_prune_keeps_the_count_and_training_goes_on(build, training_of, score, c
     training = training_of(build(pruning={"score": score}, background_color="black"))
     losses = [training.step(step) for step in range(3)]
     assert training.model.num_points == N
+    training.model.state.densification["peak"] = 77  # while it grew
+    logged = {}
+    training.run.log_scalars = lambda name, values: logged.update({name: values})
     training.step(3)
     assert training.model.num_points == N // 2
     assert training.live()
@@ -285,6 +289,9 @@ def test_prune_keeps_the_count_and_training_goes_on(build, training_of, score, c
     assert losses[-1]["main_loss"] < losses[3]["main_loss"] - 0.01
     assert "base_loss" in losses[-1]
     assert "base_loss" not in losses[0]
+    training.run_callbacks(TrainingCallbackLocation.AFTER_TRAIN, 19)
+    assert (logged["Prune"]["peak"], logged["Peak"]["gaussians"]) == (77, 77)
+    assert re.search(r"peak: 77 Gaussians, \d[\d,]{2,6} MB of cpu memory", " ".join(capsys.readouterr().out.split()))
 
 
 def test_the_rate_of_a_head_that_starts_later_begins_with_it(build, training_of):

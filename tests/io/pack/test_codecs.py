@@ -206,7 +206,9 @@ CONFIGS = [{"block": 100}, {**COARSE, "position_bits": 10}, {"head_step": 0.01, 
 
 @pytest.mark.parametrize("config", CONFIGS)
 def test_a_file_holds_the_values_rounded_in_training(tmp_path, config):
-    fitted, codecs = fit_scene(full_scene(), PackConfig(**config))
+    shown = {"a.weight": torch.logspace(0, 3, 12, dtype=torch.float64).reshape(4, 3)}
+    fitted, codecs = fit_scene(replace(full_scene(), sensitivity=Sensitivity({}, shown)), PackConfig(**config))
+    assert len(codecs.head.columns["a.weight"].unique()) == 3
     g = torch.Generator().manual_seed(1)
     moved = {name: value + 0.02 * torch.randn(value.shape, generator=g) for name, value in fitted.gaussians.items()}
     head = {name: 1.1 * value for name, value in fitted.head.items()}

@@ -186,6 +186,8 @@ def test_shapes_of_the_head(path, shape):
         assert list(read_scene(path).head["a.weight"].shape) == shape
     else:
         refused(read_scene, path, kind=PackError)
+    restate(path, {"attributes/head/tensors": [["a.weight", [1 << 27, 1]]], "attributes/head/weights": 1 << 27})
+    refused(read_scene, path, "would unpack to", PackError)
 
 
 def test_whole_numbers_may_be_written_as_real_ones_and_sections_may_reach_their_limits(path):
@@ -197,6 +199,8 @@ def test_whole_numbers_may_be_written_as_real_ones_and_sections_may_reach_their_
     found = read_scene(path)
     assert all(torch.equal(found.gaussians[name], value) for name, value in truth.gaussians.items())
     assert all(torch.equal(found.head[name], value) for name, value in truth.head.items())
+    path.write_bytes(container.restated(path.read_bytes(), {"up": [0, 0, 1], "name": "longer"}))
+    assert read_scene(path).meta == {**truth.meta, "up": [0, 0, 1], "name": "longer"}
     resection(path, "cameras/sizes", np.array([[16384, 1], [1, 16384]], np.uint32))
     assert read_scene(path).cameras["sizes"].tolist() == [[16384, 1], [1, 16384]]
 

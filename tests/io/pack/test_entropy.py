@@ -84,9 +84,15 @@ def test_the_numbers_of_the_format():
     exact = 4096 / (1 + np.exp(-np.arange(-2047, 2048) / 256))
     assert np.abs(exact % 1 - 0.5).min() > 1e-6
     assert digest.hexdigest()[:16] == "15160911aa9b93af"
-    levels = np.arange(-40, 40, dtype=np.int32).reshape(20, 4)
-    stream = entropy.encode_levels(levels, entropy.predecessors(20))
-    assert hashlib.sha256(stream.tobytes()).hexdigest()[:16] == "af8f24b70648e1b2"
+    rng = np.random.default_rng(0)  # of whole numbers, which are the same on every machine
+    levels = (rng.integers(-1, 2, (6000, 3)) << rng.integers(0, 24, (6000, 3))).astype(np.int32)
+    levels[:, 2], levels[::500], levels[1000:2000, 0] = 0, LARGEST, -1
+    near = entropy.neighbours_of(rng.integers(0, 30, (6000, 3)), 256)  # with ties
+    streams = entropy.encode_levels(levels, near), entropy.encode_gaps(cells_of(6000, 10, 256, 0), 256, 10)
+    assert [hashlib.sha256(stream.tobytes()).hexdigest()[:16] for stream in streams] == [
+        "2e5e2f9f19a55194",
+        "0decf469d7703824",
+    ]
 
 
 @given(st.binary(max_size=60), st.integers(1, 40))
