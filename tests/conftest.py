@@ -17,6 +17,7 @@ import hypothesis
 import pytest
 import torch
 from filelock import FileLock
+from short_prunes import short_distillation, short_prunes  # noqa: F401
 
 from sundae_ns.core.errors import BackendError
 from sundae_ns.cuda import kernels

@@ -12,7 +12,6 @@ import pytest
 import torch
 from packed_scenes import KINDS, write_kind
 from PIL import Image
-from short_prunes import short_prunes  # noqa: F401
 
 import sundae_ns as sn
 
@@ -20,7 +19,7 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
 @pytest.fixture
-def run(short_prunes, monkeypatch, capsys):  # noqa: F811
+def run(short_prunes, monkeypatch, capsys):
     """Run a program in this process; returns what it printed."""
 
     def run(name, *words):

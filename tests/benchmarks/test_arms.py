@@ -100,9 +100,8 @@ def test_default_arms_and_those_of_a_file_together(tmp_path):
 )
 def test_arms_are_refused_in_one_line_before_anything_is_trained(tmp_path, text, said):
     """``P`` is ``pipeline.model``."""
-    with pytest.raises(ConfigError, match=said) as raised:
+    with pytest.raises(ConfigError, match=f"^.*{said}.*$"):
         chosen(written(tmp_path, text.replace("P.", "pipeline.model.")))
-    assert "\n" not in str(raised.value)
 
 
 def test_lengths_come_from_the_method_times_a_factor(tmp_path):

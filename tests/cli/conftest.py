@@ -6,13 +6,12 @@ from pathlib import Path
 import pytest
 from fake_colmap import FakeColmap
 from run_commands import PHOTOS, Commands, photo
-from short_prunes import short_distillation, short_prunes  # noqa: F401
 
 from sundae_ns.io import run_folder
 
 
 @pytest.fixture(autouse=True)
-def _short(short_prunes):  # noqa: F811
+def _short(short_prunes):
     """No test here is about how good a prune is."""
 
 

@@ -17,8 +17,7 @@ def run(*words):
 
 @pytest.fixture
 def source(tmp_path):
-    generator = torch.Generator().manual_seed(0)
-    points = torch.rand(200, 3, generator=generator)
+    points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0))
     sn.save(sn.Scene.from_points(points, points), tmp_path / "a.ply")
     return tmp_path / "a.ply"
 

@@ -121,8 +121,7 @@ def test_a_full_disk_is_one_line(here, full, capsys):
         assert not out.exists()
 
 
-BUFFERED = pytest.mark.parametrize("unbuffered", ["", "1"])
-PRINTING = pytest.mark.parametrize("words", ["help", "info --help"])
+PRINTING = pytest.mark.parametrize(("words", "unbuffered"), [("help", "1"), ("help", ""), ("info --help", "")])
 
 
 def installed(words, unbuffered, **options):
@@ -132,7 +131,6 @@ def installed(words, unbuffered, **options):
     return subprocess.Popen(words, stderr=subprocess.PIPE, env=environment, **options)
 
 
-@BUFFERED
 @PRINTING
 def test_a_full_disk_behind_stdout_is_one_line(words, unbuffered):
     with open("/dev/full", "w") as nowhere, installed(words, unbuffered, stdout=nowhere) as process:
@@ -141,7 +139,6 @@ def test_a_full_disk_behind_stdout_is_one_line(words, unbuffered):
     assert process.returncode == 2
 
 
-@BUFFERED
 @PRINTING
 def test_a_reader_of_stdout_that_has_left_is_no_error(words, unbuffered):
     with installed(words, unbuffered, stdout=subprocess.PIPE) as process:
@@ -150,7 +147,7 @@ def test_a_reader_of_stdout_that_has_left_is_no_error(words, unbuffered):
     assert process.returncode == 141
 
 
-@PRINTING
+@pytest.mark.parametrize("words", ["help", "info --help"])
 def test_a_closed_stdout_is_no_error(words):
     with installed(words, "", preexec_fn=partial(os.close, 1)) as process:
         assert process.stderr.read() == b""

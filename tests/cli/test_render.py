@@ -40,8 +40,7 @@ def frames_of(path):
 def folder(tmp_path_factory):
     """A scene without views as ``.ply``, and with two of odd sides as ``.sundae``."""
     folder = tmp_path_factory.mktemp("scenes")
-    generator = torch.Generator().manual_seed(0)
-    scene = sn.Scene.from_points(*(torch.rand(100, 3, generator=generator) for _ in range(2)))
+    scene = sn.Scene.from_points(*torch.rand(2, 100, 3, generator=torch.Generator().manual_seed(0)))
     sn.save(dataclasses.replace(scene, up=(0.0, 0.0, 1.0)), folder / "cloud.ply")
     sn.save(dataclasses.replace(scene, cameras=tuple(VIEWS)), folder / "packed.sundae")
     return folder

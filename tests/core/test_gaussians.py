@@ -54,6 +54,10 @@ def test_one_primitive_per_point():
     # The width is the mean distance to three neighbours.
     expected = torch.cdist(points, points).sort(dim=1).values[:, 1:4].mean(dim=1)
     torch.testing.assert_close(params["scales"].exp(), expected[:, None].expand(50, 3))
+    points[:10] = points[0]  # coincident ones have a finite width
+    scales = from_points(points, rgb, sh_degree=0)["scales"]
+    assert torch.isfinite(scales).all()
+    torch.testing.assert_close(scales[:10], scales.min().expand(10, 3))
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 10])
@@ -62,14 +66,6 @@ def test_few_points(n):
     for places in (points, points[:1].expand(n, 3)):
         params = from_points(places, rgb, sh_degree=1)
         assert all(len(value) == n and torch.isfinite(value).all() for value in params.values())
-
-
-def test_coincident_points_get_a_finite_width():
-    points, rgb = cloud()
-    points[:10] = points[0]
-    scales = from_points(points, rgb, sh_degree=0)["scales"]
-    assert torch.isfinite(scales).all()
-    torch.testing.assert_close(scales[:10], scales.min().expand(10, 3))
 
 
 def test_points_that_are_not_finite_are_dropped():

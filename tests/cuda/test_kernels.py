@@ -185,10 +185,8 @@ def test_the_loss_on_a_gpu(size):
 
 def reduced(height, width, x, device="cpu"):
     """A view from ``x`` along the z axis, a little turned, of random blobs."""
-    generator = torch.Generator().manual_seed(height)
-    image = torch.nn.functional.interpolate(
-        torch.rand(1, 3, height // 3, width // 3, generator=generator), (height, width), mode="bilinear"
-    )[0]
+    blobs = torch.rand(1, 3, height // 3, width // 3, generator=torch.Generator().manual_seed(height))
+    image = torch.nn.functional.interpolate(blobs, (height, width), mode="bilinear")[0]
     eye, target = (x, -0.1 * x, 0.0), (0.9 * x, -0.1 * x, 1.0)
     camera = Camera.look_at(eye, target, (0.0, -1.0, 0.0), fov=40.0, width=width, height=height)
     K = torch.tensor([[1.1 * width, 0, width / 2 + 1], [0, 1.2 * width, height / 2], [0, 0, 1]])

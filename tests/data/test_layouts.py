@@ -11,6 +11,7 @@ from photos import photos
 from small_captures import write_text_model
 
 from sundae_ns.core.errors import DataError
+from sundae_ns.core.files import write_text
 from sundae_ns.data import layouts
 from sundae_ns.data.capture import beside
 from sundae_ns.data.colmap import check_colmap
@@ -96,18 +97,13 @@ def _text(data):
     write_text_model(data / "colmap" / "sparse" / "0", ["a.png"])
 
 
-def _inner(data):
-    (data / "room").mkdir()
-    (data / "room" / "transforms.json").write_text("{}")
-
-
 ADVICE = {
     "several models": (_several, "add `colmap --colmap-path sparse/1` (the largest of 3 models, with 20 images)"),
     "a model in sparse": (lambda data: model(data / "sparse"), "add `colmap --colmap-path sparse` to ns-train"),
     "a text": (_text, "add `colmap --colmap-path colmap/sparse/0` to ns-train"),
     "a model alone": (model, "is a COLMAP model without its images"),
     "Blender": (blender, "it is in Blender's layout (transforms_train.json): add `blender-data` to ns-train"),
-    "a folder further in": (_inner, "room has; give that folder"),
+    "a folder further in": (lambda data: write_text(data / "room/transforms.json", "{}"), "room has; give that folder"),
     "another name": (lambda data: (data / "Transforms.json").touch(), "(there is Transforms.json); make a capture of"),
     "nothing": (lambda _: None, "make a capture of images with `sundae poses "),
 }

@@ -64,9 +64,8 @@ def test_features_mode_sees_features_alone():
 
 @pytest.mark.parametrize("options", [{"num_features": 0}, {"pixel_unshuffle": 0}, {"mode": "off"}])
 def test_bad_options(options):
-    with pytest.raises(ConfigError) as error:
+    with pytest.raises(ConfigError, match="^.+$"):
         CompensationHead(HeadConfig(**options))
-    assert "\n" not in str(error.value)
 
 
 WILD = {
@@ -191,9 +190,6 @@ def test_resizing_keeps_the_mean(size):
     assert out.shape == (*size, 3)
     assert out.mean() == pytest.approx(float(image.mean()), abs=0.03)
     assert torch.equal(resize(image, 16, 24), image)
-
-
-# --------------------------------------------------------------------------------------------------------- the network
 
 
 def test_the_papers_size_and_a_limited_width():

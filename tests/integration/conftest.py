@@ -14,7 +14,6 @@ import pytest
 import torch
 import yaml
 from nerfstudio.configs.method_configs import all_methods
-from short_prunes import short_distillation, short_prunes  # noqa: F401
 from trial_runs import set_options, tidy
 
 from harness.still_life import write_still_life

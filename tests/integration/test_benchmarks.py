@@ -174,16 +174,12 @@ else:
 """A program with the command line of splat-transform."""
 
 
-def formats_in(path):
-    return list(csv.DictReader(path.read_text().splitlines()))
-
-
 def test_each_format_has_a_row(tiny, tmp_path, monkeypatch):
     out, transform = tmp_path / "formats.csv", tmp_path / "splat-transform"
     transform.write_text(TRANSFORM)
     transform.chmod(transform.stat().st_mode | stat.S_IXUSR)
     run(monkeypatch, "bench_formats.py", tiny.folder, "-o", out, "--splat-transform", transform)
-    rows = {(row["format"], row["program"]): row for row in formats_in(out)}
+    rows = {(row["format"], row["program"]): row for row in csv.DictReader(out.read_text().splitlines())}
     ours = [(kind, "sundae_ns") for kind in (".ply", ".spz", ".sog", ".sundae")]
     assert list(rows) == [("fp32", ""), *ours, (".sog", "splat-transform 9.8.7")]
     opened, scene = load_model(tiny.folder), sn.load(tiny.folder)

@@ -51,10 +51,6 @@ def test_nerfstudio_would_run_it(tmp_path, monkeypatch):
     assert Path("PWNED").exists()
 
 
-def test_no_command_is_forgotten():
-    assert WORDS.keys() == COMMANDS.keys()
-
-
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.usefixtures("hostile", "short_prunes", "short_distillation")
 def test_no_command_runs_it(command, monkeypatch):

@@ -136,9 +136,6 @@ def at(folder):
     return (folder / "a.html").as_uri()
 
 
-# -------------------------------------------------------------------------------------------------------------- images
-
-
 @pytest.mark.parametrize("name", KINDS)
 def test_images_of_the_page_are_those_of_python(name, tmp_path):
     packed = write_kind(tmp_path / "a.sundae", KINDS[name])
@@ -290,8 +287,6 @@ def test_a_folder_is_served_and_says_so_when_opened_from_disk(site, folder):
         until(page, "window.sundae?.state === 'failed'", "the message")
         assert "serve this folder" in page.evaluate("sundae.message")
 
-
-# ------------------------------------------------------------------------------------------------------------ controls
 
 WEIGHTS = """
 window.weights = [];
@@ -493,8 +488,6 @@ def test_controls_have_names_and_loading_a_bar(site):
         assert roles <= {role for role, _ in parts}
         assert all(name and name.strip("‹›×") for role, name in parts if role in roles), parts
 
-
-# ---------------------------------------------------------------------------------------------------------- lost GPUs
 
 DEVICES = """
 window.devices = [];

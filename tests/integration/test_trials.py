@@ -73,9 +73,6 @@ def centers_of(model):
     return model.gauss_params["means"].detach().clone()
 
 
-# ----------------------------------------------------------------------------------------------------------- the count
-
-
 @pytest.fixture
 def judge_counts(monkeypatch):
     """Fix what the counts lose against all Gaussians, PSNR in dB by share, and what a head gains at a tenth."""
@@ -218,9 +215,6 @@ def test_where_trials_cannot_decide_a_share_is_kept_and_one_line_says_so(make_co
     assert trainer.pipeline.model.num_points == kept
     assert " ".join(capsys.readouterr().out.split()).count(f"pruning keeps {said}") == 1
     assert "count" not in records_of(trainer)
-
-
-# ------------------------------------------------------------------------------------------------------------ the head
 
 
 @pytest.fixture
@@ -379,8 +373,6 @@ def test_several_gpus_train_the_head_without_trials(make, judge_heads):
     assert deciding.kept == {}
 
 
-# ---------------------------------------------------------------------------------------------------------- the length
-
 DECIDED = PRUNE_AT + 2 * LENGTH
 """Step of the decision about the length, after trials of no head and of a head."""
 
@@ -488,9 +480,6 @@ def test_a_paused_run_is_resumed_with_figures_and_trains_again_after_its_schedul
     assert len(losses) == 2
     assert all(0 < loss < 1 for loss in losses)
     assert "PSNR" in capsys.readouterr().out
-
-
-# -------------------------------------------------------------------------------------------------------------- resumed
 
 
 @pytest.mark.parametrize(

@@ -85,9 +85,8 @@ def test_full_disk(tmp_path, name):
     noise, field = Image.effect_noise((400, 300), 100), small_field(1000)
     write = partial(write_ply, params=field) if name == "a.ply" else partial(write_image, image=noise)
     (tmp_path / name).write_text("old")
-    with small_disk(10_000), pytest.raises(StorageError, match=rf"cannot write .*{name}: .*ulimit") as caught:
+    with small_disk(10_000), pytest.raises(StorageError, match=rf"^cannot write .*{name}: .*ulimit.*$"):
         write(tmp_path / name)
-    assert "\n" not in str(caught.value)
     assert (tmp_path / name).read_text() == "old"
     assert os.listdir(tmp_path) == [name]
     write(tmp_path / name)

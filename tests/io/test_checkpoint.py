@@ -73,9 +73,8 @@ def _without(name):
 )
 def test_a_checkpoint_that_does_not_fit_is_refused(state, cause):
     check(model_state(9))  # another number of Gaussians fits
-    with pytest.raises(CheckpointError, match=cause) as caught:
+    with pytest.raises(CheckpointError, match=f"^.*{cause}.*$"):
         check(state)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("prefix", ["_model.", "_model.module."])

@@ -102,11 +102,12 @@ def test_a_file_that_is_no_run_is_refused(tmp_path, text):
     refused(load_config, tmp_path, "cannot be read", CheckpointError)
 
 
-def test_a_capture_that_has_moved_with_its_run_is_found(tmp_path):
+def test_a_capture_that_has_moved_with_its_run_is_found_and_the_length_of_its_schedule(tmp_path):
     config = copy.deepcopy(sundae_tiny.config)
     config.output_dir, config.experiment_name, config.timestamp = tmp_path / "here" / "outputs", "e", "t"
     config.pipeline.datamanager.data = tmp_path / "here" / "capture"
     config.pipeline.datamanager.data.mkdir(parents=True)
+    config.schedule_length, config.max_num_iterations = 500, 20
     config.save_config()
     assert load_config(config.get_base_dir() / "config.yml").pipeline.datamanager.data == tmp_path / "here" / "capture"
     (tmp_path / "here").rename(tmp_path / "there")
@@ -114,15 +115,7 @@ def test_a_capture_that_has_moved_with_its_run_is_found(tmp_path):
     assert load_config(moved).pipeline.datamanager.data == tmp_path / "there" / "capture"
     (tmp_path / "there" / "capture").rmdir()
     assert load_config(moved).pipeline.datamanager.data == tmp_path / "here" / "capture", "the error names this one"
-
-
-def test_the_length_of_the_schedule(tmp_path):
-    config = copy.deepcopy(sundae_tiny.config)
-    config.output_dir, config.experiment_name, config.timestamp = tmp_path, "e", "t"
-    config.schedule_length, config.max_num_iterations = 500, 20
-    config.save_config()
-    path = config.get_base_dir() / "config.yml"
-    assert schedule_length(path) == 500
+    assert schedule_length(moved) == 500
     for text in ("a: 1", "schedule_length: null", "[]"):
-        path.write_text(text)
-        refused(schedule_length, path, "states no length", CheckpointError)
+        moved.write_text(text)
+        refused(schedule_length, moved, "states no length", CheckpointError)

@@ -8,8 +8,8 @@ from sundae_ns.io.coordinates import recentred, similarity, upward
 
 
 def rotation(seed=1):
-    generator = torch.Generator().manual_seed(seed)
-    q, _ = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))
+    values = torch.randn(3, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    q, _ = torch.linalg.qr(values)
     return q * q.det()
 
 

@@ -11,8 +11,7 @@ from sundae_ns.plugin.distill import Distillation
 @pytest.fixture(scope="module")
 def ball():
     """Points on a sphere, coloured in patches."""
-    generator = torch.Generator().manual_seed(0)
-    points = torch.nn.functional.normalize(torch.randn(1500, 3, generator=generator), dim=1)
+    points = torch.nn.functional.normalize(torch.randn(1500, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     scene = sn.Scene.from_points(points, (points * 4).sin() / 2 + 0.5)
     scene.gaussians["opacities"][:] = 3.0
     return scene

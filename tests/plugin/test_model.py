@@ -50,11 +50,6 @@ def test_gsplat_without_cuda_is_refused_before_the_first_step(build, training_of
         training_of(model)
 
 
-def saved(model, path):
-    torch.save(model.state_dict(), path)
-    return torch.load(path, weights_only=True)
-
-
 @pytest.mark.parametrize("steps", [1, 5])
 def test_round_trip_into_another_count_keeps_optimizers_alive(build, training_of, tmp_path, steps):
     """During densification, and after the prune."""
@@ -63,7 +58,8 @@ def test_round_trip_into_another_count_keeps_optimizers_alive(build, training_of
         source.step(step)
     assert source.model.num_points == (60 if steps == 1 else 30)
     held = dict(target.model.gauss_params.items())
-    target.model.load_state_dict(saved(source.model, tmp_path / "a.pt"))
+    torch.save(source.model.state_dict(), tmp_path / "a.pt")
+    target.model.load_state_dict(torch.load(tmp_path / "a.pt", weights_only=True))
     assert all(target.model.gauss_params[name] is value for name, value in held.items())
     for name, value in source.model.state_dict().items():
         if isinstance(value, Tensor):

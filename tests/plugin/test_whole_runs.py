@@ -173,9 +173,6 @@ if __name__ == "__main__":
     main(Path(sys.argv[1]), sys.argv[2])
 
 
-# -------------------------------------------------------------------------------------------------------------- tests
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, run_ranks):
     """Runs of two ranks, trained once for all tests."""

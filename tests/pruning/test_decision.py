@@ -311,9 +311,8 @@ def test_invalid_input_raises_one_line():
         (DataError, r"score has shape \[3\] for 60", lambda: decide(params, three, 6)),
     ]
     for error, message, call in cases:
-        with pytest.raises(error, match=message) as caught:
+        with pytest.raises(error, match=f"^.*{message}.*$"):
             call()
-        assert "\n" not in str(caught.value)
     decide_share(params, RULES["a function"])  # it needs no contribution, nor does a field of which all stays
     decide_share(params, DEFAULT, 1.0)
 

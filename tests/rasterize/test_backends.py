@@ -91,9 +91,6 @@ def compare(ours, exact, values, gradients):
         assert error <= (values if name in ("image", "alpha", "depth") else gradients), (name, error)
 
 
-# ------------------------------------------------------------------------------------------------- against other truths
-
-
 def loop_over_pixels(values, camera, antialiased):
     """Image, alpha, expected depth and weights, blended pixel by pixel in a Python loop."""
     width, height = camera["width"], camera["height"]
@@ -293,9 +290,6 @@ def test_gradients_of_some_inputs_by_some_outputs(wanted, output):
         assert deviation(ours, exact) < 1e-10  # measured: 1.5e-14
 
 
-# ------------------------------------------------------------------------------------------------------------ harmonics
-
-
 def harmonics(degree, directions, coeffs, backend):
     """Values, and the gradients of a random functional of them."""
     leaves = [value.detach().clone().requires_grad_() for value in (directions, coeffs)]
@@ -322,9 +316,6 @@ def test_compiled_harmonics_match_the_reference(degree, dtype):
         assert torch.equal(value, same)
     torch.testing.assert_close(ours[0][1], ours[0][2])
     assert not ours[1][1].any()
-
-
-# ------------------------------------------------------------------------------------------------------------ on a GPU
 
 
 def crowd(opacity, channels=16, n=3000):
@@ -419,9 +410,6 @@ def test_no_gaussians_are_an_empty_image_and_float64_is_refused():
     directions = torch.ones(1, 3, device="cuda", dtype=F64)
     with pytest.raises(BackendError, match="float32 on cuda"):
         spherical_harmonics(0, directions, directions[:, None], backend=on_gpu("auto"))
-
-
-# ------------------------------------------------------------------------------------------ promises of compiled loops
 
 
 SMALL = scene(800), make_view(60, 50)

@@ -31,9 +31,6 @@ def test_kernels_compile_for_gpus(compile_for_gpu, monkeypatch):
         compile_for_gpu("blending.cu", architecture, gsplat_kernels.blending_options(channels, absgrad=absgrad))
 
 
-# --------------------------------------------------------------------------------------------------------------- tiles
-
-
 def ellipses(n, width, height, *, largest=4.0, power=1, opacity=1.0, channels=3, seed=0):
     """Footprints in and around an image, float64: of all shapes, some opaque, some too faint to be blended.
 
@@ -190,8 +187,6 @@ def test_more_tiles_than_16_bits_count():
     assert {tile % 3300 // 100 for tile, list_ in enumerate(found) if len(list_)} == {32}
 
 
-# ------------------------------------------------------------------------------------------------------------ blending
-
 NAMES = ("means2d", "conics", "colors", "opacities")
 
 
@@ -256,9 +251,6 @@ def test_an_empty_list_leaves_the_background():
     assert not alpha.any()
     (image.sum() + alpha.sum()).backward()
     assert all(not leaf.grad.any() for leaf in ours.values() if leaf.grad is not None)
-
-
-# ------------------------------------------------------------------------------------------------------------- colours
 
 
 def colors_inputs():

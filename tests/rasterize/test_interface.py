@@ -52,9 +52,8 @@ assert "gsplat" not in sys.modules
 def test_a_backend_that_cannot_run_is_one_line_and_auto_falls_back(name, device, gpu, message, instead, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
     monkeypatch.setattr(interface, "_kernel_problem", lambda: "its kernels do not run")
-    with pytest.raises(BackendError, match=f"{message}; or use the backend 'reference'$") as caught:
+    with pytest.raises(BackendError, match=f"^.*{message}; or use the backend 'reference'$"):
         select_backend(name, device)
-    assert "\n" not in str(caught.value)
     assert select_backend("auto", device).name == instead
     with pytest.raises(ConfigError, match="auto, gsplat, cpu or reference"):
         select_backend("vulkan", device)
@@ -114,8 +113,6 @@ def test_blending_weights_with_pixel_weights():
     torch.testing.assert_close(sum(parts), 2.5 * total)
     assert not torch.equal(*parts)
 
-
-# --------------------------------------------------------------------------------------------------------------- memory
 
 BACKENDS = ("cpu", "reference")
 

@@ -61,8 +61,6 @@ def test_every_blended_pixel_is_listed_and_few_others(dtype):
     assert visible.sum() > 0.3 * listed.sum()  # measured: 0.42
 
 
-# ---------------------------------------------------------------------------------------------------------- compilation
-
 LOOP = """
 import numpy as np
 from sizes_of_this_test import SIZE

@@ -27,10 +27,7 @@ def test_a_row_pairs_each_time_with_the_quality_of_its_configuration(measured):
     assert (row["bytes_primitives"], row["bytes_head"], row["bytes_total"]) == ("2000000", "1000000", "3000000")
     assert (row["scene"], row["keep_ratio"], row["seed"]) == ("bicycle", "0.1", "")
     assert row["command"] == 'sundae compare "a, b"'
-
-
-def test_without_a_head_full_and_base_are_the_same(measured):
-    run = measured(head=False)
+    run = measured(head=False)  # full and base are the same
     assert not run.has_head
     row = row_of(run)
     assert (row["psnr"], row["ms_frame"]) == (row["psnr_base"], row["ms_splat"]) == ("25.0", "2.0")

@@ -113,10 +113,7 @@ def test_the_worst_and_the_best_view_are_among_those_that_are_shown():
             assert len(chosen) == min(most, count)
             assert chosen == sorted(set(chosen))
             assert {int(np.argmin(qualities)), int(np.argmax(qualities))} <= set(chosen)
-
-
-def test_other_views_are_evenly_spaced_between_them():
-    qualities = [float(7 * i % 300) for i in range(300)]
+    qualities = [float(7 * i % 300) for i in range(300)]  # others are evenly spaced between them
     ranks = sorted(qualities[i] for i in choose_cameras(qualities, 24))
     assert set(np.diff(ranks)) == {13.0}
     qualities[31] = math.nan  # counts as worst
@@ -139,14 +136,11 @@ def test_errors_have_their_place_among_the_colors():
     assert np.array_equal(error_map(one, photo), error_map(photo, three))
 
 
-def test_a_smaller_error_map_has_the_mean_of_its_pixels():
+def test_a_smaller_error_map_has_the_mean_of_its_pixels_and_both_images_have_one_size():
     photo, rendering = torch.zeros(2, 8, 16, 3)
     rendering[:, ::2] = LARGEST_ERROR / 255
     half = torch.full((4, 8, 3), LARGEST_ERROR / 255 / 2)
     assert np.array_equal(error_map(rendering, photo, (8, 4)), error_map(half, torch.zeros(4, 8, 3)))
-
-
-def test_an_error_map_needs_two_images_of_one_size():
     for shape in ((8, 9, 3), (8, 8, 1), (8, 8)):
         with pytest.raises(DataError, match="give two of one size"):
             error_map(torch.zeros(shape), torch.zeros(8, 8, shape[-1]))

@@ -15,7 +15,6 @@ from fields import random_field
 from hypothesis import given
 from hypothesis import strategies as st
 from nerfstudio.cameras.cameras import Cameras
-from short_prunes import short_prunes  # noqa: F401
 
 import sundae_ns as sn
 from sundae_ns.core.covariance import rotation_matrices
@@ -114,9 +113,8 @@ def test_cameras_of_a_capture_move_with_its_model(tmp_path):
     ],
 )
 def test_files_without_usable_cameras_are_refused_in_one_line(content, message, tmp_path):
-    with pytest.raises(DataError, match=message) as caught:
+    with pytest.raises(DataError, match=f"^.*{message}.*$"):
         sn.cameras_of(written(tmp_path, content))
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, 1.0, 0.0)])
@@ -359,8 +357,7 @@ UP = (0.6, 0.0, -0.8)
 
 
 def two_seen(**options):
-    generator = torch.Generator().manual_seed(0)
-    points = torch.rand(80, 3, generator=generator)
+    points = torch.rand(80, 3, generator=torch.Generator().manual_seed(0))
     cameras = tuple(sn.Camera.look_at((0.5 + dx, -2.0, 0.5), (0.5, 0.5, 0.5), width=40, height=30) for dx in (0.0, 0.8))
     return dataclasses.replace(sn.Scene.from_points(points, points), cameras=cameras, **options)
 

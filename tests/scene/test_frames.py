@@ -261,9 +261,8 @@ def test_a_view_of_many_more_pairs(build, perturb, camera):
 
 
 def features(n=2000):
-    generator = torch.Generator().manual_seed(0)
     spread = torch.tensor([0.1, 3.0, 0.01, 1.0, 0.3])
-    return torch.randn(n, 5, generator=generator) * spread + torch.arange(5.0)
+    return torch.randn(n, 5, generator=torch.Generator().manual_seed(0)) * spread + torch.arange(5.0)
 
 
 def test_principal_components_are_sorted_by_variance():

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from fields import random_field
-from short_prunes import SHORT, short_prunes  # noqa: F401
+from short_prunes import SHORT
 
 import sundae_ns as sn
 from sundae_ns.head.head import CompensationHead, HeadConfig

@@ -10,7 +10,6 @@ import torch
 from fields import random_field
 from photos import photo
 from PIL import Image
-from short_prunes import short_prunes  # noqa: F401
 
 import sundae_ns as sn
 from sundae_ns.head.head import CompensationHead, HeadConfig
@@ -190,9 +189,8 @@ REFUSED = {
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_is_refused_in_one_line(name):
     call, words = REFUSED[name]
-    with pytest.raises(sn.SundaeError, match=words) as caught:
+    with pytest.raises(sn.SundaeError, match=f"^.*(?:{words}).*$") as caught:
         call()
-    assert "\n" not in str(caught.value)
     assert ";" in str(caught.value)
 
 

@@ -6,7 +6,6 @@ from unittest.mock import Mock
 import pytest
 import torch
 from fields import random_field
-from short_prunes import short_prunes  # noqa: F401
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
@@ -23,8 +22,7 @@ N = 1500
 
 def scene(encoding="harmonics"):
     """A ball with stripes."""
-    generator = torch.Generator().manual_seed(0)
-    points = torch.nn.functional.normalize(torch.randn(N, 3, generator=generator), dim=1)
+    points = torch.nn.functional.normalize(torch.randn(N, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     made = sn.Scene.from_points(points, 0.5 + 0.4 * (6 * points).sin())
     made.gaussians["opacities"][:], made.gaussians["scales"][:] = 2.0, math.log(0.05)
     if encoding == "harmonics":

@@ -8,7 +8,6 @@ import pytest
 import torch
 from fields import random_field
 from packed_scenes import KINDS, write_kind
-from short_prunes import short_prunes  # noqa: F401
 
 import sundae_ns as sn
 from sundae_ns.core.errors import BackendError, ConfigError, MemoryExhaustedError

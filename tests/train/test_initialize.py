@@ -76,9 +76,8 @@ def test_a_ply_of_the_capture_is_moved_into_the_model(build, training_of, tmp_pa
     assert model.gauss_params["features"].shape == (N, 5)
     as_is = build(warm_start=tmp_path / "a.ply", warm_start_frame="model")
     torch.testing.assert_close(as_is.means.detach(), params["means"])
-    with pytest.raises(CheckpointError, match="warm-start-frame model") as caught:
+    with pytest.raises(CheckpointError, match="^.*warm-start-frame model.*$"):
         training_of(build(warm_start=tmp_path / "a.ply"))
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("name", [name for name in FOREIGN if name not in ("colors.ply", "a.ksplat")])

@@ -202,9 +202,8 @@ IMPOSSIBLE = [
 
 @pytest.mark.parametrize(("options", "words"), IMPOSSIBLE)
 def test_impossible_options_are_refused_in_one_line(options, words):
-    with pytest.raises(ConfigError, match=words) as caught:
+    with pytest.raises(ConfigError, match=f"^.*{words}.*$"):
         PruningConfig(**options).validate()
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

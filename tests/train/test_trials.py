@@ -211,9 +211,8 @@ def test_a_checkpoint_without_a_decision_names_the_option(undecided):
 def test_a_state_without_a_field_to_go_back_to_is_refused(undecided, stage, kept):
     model, trials = undecided
     tried = [Tried("head", 9, "plain", 9)]
-    with pytest.raises(CheckpointError, match="lacks a field") as raised:
+    with pytest.raises(CheckpointError, match="^.*lacks a field.*$"):
         trials.load_state_dict(model.state, saved(model.state, stage, kept, tried=tried))
-    assert "\n" not in str(raised.value)
 
 
 def test_only_trials_do_without_mirrored_images(undecided):

@@ -117,8 +117,7 @@ def test_rotations(n, seed, step):
 
 
 def test_the_bound_of_rotations_is_nearly_reached():
-    rng = np.random.default_rng(0)
-    q = rng.normal(size=(100_000, 4)).astype(np.float32)
+    q = np.random.default_rng(0).normal(size=(100_000, 4)).astype(np.float32)
     turned, _ = module.aligned(q, np.zeros((len(q), 3), np.float32))
     worst = angles(turned.astype(np.float64), through_rotations(q, 0.01).astype(np.float64)).max()
     assert 0.85 * module.rotation_bound(0.01) < worst <= module.rotation_bound(0.01)

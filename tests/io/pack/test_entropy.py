@@ -65,8 +65,7 @@ def test_contexts_use_neighbours():
 
 
 def test_neighbours_are_the_nearest_of_the_window():
-    rng = np.random.default_rng(0)
-    cells, block = rng.integers(0, 1000, (500, 3)), 200
+    cells, block = np.random.default_rng(0).integers(0, 1000, (500, 3)), 200
     near = entropy.neighbours_of(cells, block)
     for i in range(500):
         first = max(i // block * block, i - entropy.WINDOW)

@@ -84,9 +84,8 @@ def test_a_scene_that_compresses_too_well_is_padded(tmp_path, scene):
 
 def test_packing_takes_few_bytes(tmp_path):
     """This field takes 25 bytes per Gaussian instead of 272."""
-    g = torch.Generator().manual_seed(0)
     truth = random_field(20_000, 3, 9)
-    grey = torch.randn(20_000, 15, 1, generator=g).expand(-1, -1, 3)
+    grey = torch.randn(20_000, 15, 1, generator=torch.Generator().manual_seed(0)).expand(-1, -1, 3)
     truth["features_rest"] = 0.05 * grey * torch.rand(20_000, 1, 1) ** 4
     report = write_scene(tmp_path / "a.sundae", PackedScene(truth))
     assert report.bits["means"] < 30
