@@ -55,10 +55,10 @@ def matrix(value: Any, rows: Sequence[int], name: str, where: str) -> np.ndarray
 def rigid(pose: np.ndarray, where: str) -> np.ndarray:
     """A camera pose ``[3 or 4, 4]`` without a scale in its rotation; ``DataError`` if its axes are no rotation."""
     axes = pose[:3, :3]
-    scale = abs(float(np.linalg.det(axes))) ** (1 / 3)
-    if np.abs(axes.T @ axes / scale**2 - np.eye(3)).max() > 0.1:
+    scale = float(np.cbrt(np.linalg.det(axes)))
+    if scale < 0 or np.abs(axes.T @ axes / scale**2 - np.eye(3)).max() > 0.1:
         raise DataError(f"{where}: transform_matrix is no camera pose, as its first three columns are not a rotation")
-    return pose if abs(scale - 1) <= 1e-3 else np.hstack([pose[:, :3] / scale, pose[:, 3:]])  # else rounded numbers
+    return pose if abs(scale - 1) <= 1e-3 else np.hstack([pose[:, :3] / scale, pose[:, 3:]])  # rounded ones stay
 
 
 def read_json(path: Path) -> dict[str, Any]:

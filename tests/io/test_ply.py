@@ -189,9 +189,10 @@ def test_marks_of_a_header(tmp_path, comments, marks):
     write_ply(tmp_path / "a.ply", small_field(3), comments=comments)
     assert verdict(lambda: ply_marks(tmp_path / "a.ply"), 50_000) is None
     assert ply_marks(tmp_path / "a.ply") == marks
-    content = (tmp_path / "a.ply").read_bytes().replace(b"\ncomment ", b"\nobj_info ")
-    (tmp_path / "a.ply").write_bytes(content)
-    assert ply_marks(tmp_path / "a.ply") == marks
+    content = (tmp_path / "a.ply").read_bytes()
+    for word in (b"\nobj_info ", b"\nCOMMENT ", b"\ncomment\t"):
+        (tmp_path / "a.ply").write_bytes(content.replace(b"\ncomment ", word))
+        assert ply_marks(tmp_path / "a.ply") == marks
 
 
 def _without(*names):
