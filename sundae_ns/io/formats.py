@@ -32,6 +32,7 @@ _FIRST_BYTES |= {b"\x1f\x8b": "spz", b"NGSP": "spz", b"PK\x03\x04": "sog", b"glT
 _UNREAD = {
     ".lcc": "is a scene of XGRIDS; convert it to .ply with SuperSplat or splat-transform",
     ".rad": "is a scene of Spark; convert the .ply that it was made of",
+    ".html": "is a web page; give the scene that it was made of",
     ".gltf": "is a glTF scene in several files; export it as .glb",
     ".pth": "is a checkpoint of another trainer; give its .ply, such as point_cloud/iteration_*/point_cloud.ply",
 }

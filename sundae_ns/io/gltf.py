@@ -188,8 +188,8 @@ def _primitives(document: Json, binary: memoryview) -> Iterator[tuple[Json, Tran
             accessors = node.get("extensions", {}).get(_INSTANCING, {}).get("attributes", {}).items()
             parts = {name.lower(): _values(document, binary, j) for name, j in accessors if not name.startswith("_")}
             instances += max(map(len, parts.values()), default=1)
-            if instances > _MOST_NODES:
-                raise ValueError(f"it has over {_MOST_NODES:,} instances of meshes")
+            if instances > _MOST_NODES or len({*map(len, parts.values())}) > 1:
+                raise ValueError(f"its instances of meshes are over {_MOST_NODES:,}, or have unequal accessors")
             placed = transforms[i] @ _transforms(parts) if parts else transforms[i : i + 1]
             by_mesh.setdefault(_index(node["mesh"]), []).append(placed)
     for mesh, each in by_mesh.items():

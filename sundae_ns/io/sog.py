@@ -341,8 +341,7 @@ def palette(rows: NDArray[np.float32], max_rows: int = MAX_PALETTE) -> tuple[NDA
 
     By 256 coarse cells, with centres in proportion to their rows: one k-means of 65,536 centres would take hours.
     """
-    n = len(rows)
-    if n <= max_rows:
+    if (n := len(rows)) <= max_rows:
         return rows, np.arange(n)
     generator = torch.Generator().manual_seed(0)
     vectors = torch.from_numpy(np.ascontiguousarray(rows)).double()

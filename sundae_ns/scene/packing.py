@@ -122,8 +122,7 @@ def _head_of(packed: PackedScene, stated: Mapping[str, Any] | None) -> Compensat
         raise refusal("another number of features than it has")
     whole = {name: int(stated[name]) for name in ("pixel_unshuffle", "num_features")}
     config = HeadConfig(**{**stated, **whole}, start_at=0)
-    head = CompensationHead.of_weights(config, packed.head)
-    if head is None:
+    if (head := CompensationHead.of_weights(config, packed.head)) is None:
         raise refusal("another head than it has")
     return head
 

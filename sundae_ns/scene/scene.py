@@ -124,7 +124,8 @@ class Scene:
         deviations, alphas, turns = floats(scales, "scales"), floats(opacities, "opacities"), floats(quats, "quats")
         if bool((deviations < 0).any()) or bool(((alphas - 0.5).abs() > 0.5).any()):
             raise DataError("scales are negative or opacities beyond [0, 1]; give neither logarithms nor logits")
-        turns = turns / turns.abs().amax(dim=-1, keepdim=True).clamp_min(1e-38)  # their squares are normal float32
+        # Their squares may be out of the range of float32.
+        turns = torch.nn.functional.normalize(turns / turns.abs().amax(dim=-1, keepdim=True).clamp_min(1e-38), dim=-1)
         params = {"means": means, "scales": deviations.log(), "quats": turns, "opacities": alphas.logit().view(-1, 1)}
         return cls(Gaussians({**params, "features_dc": harmonics[:, 0], "features_rest": harmonics[:, 1:]}))
 
