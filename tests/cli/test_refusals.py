@@ -40,7 +40,7 @@ REFUSALS = {
     "prune in.ply -o in.bin/a.ply": "in.bin is no folder",
     "prune in.ply -o /proc/a.ply": "cannot write to /proc (",
     "prune a.ksplat -o a.ply": "a.ksplat is not a complete .ksplat (",
-    "pack a.html -o a.sundae": "a.html is a web page; give the scene",
+    "pack page.html -o a.sundae": "page.html is a web page; give the scene",
     "prune trained -o a.ply": "trained is a folder of 3DGS; give trained/point_cloud/iteration_30000/point",
     "prune in.ply -o b.ply --distill": "b.ply cannot hold a head; name it .sundae, or leave",
     "prune in.ply -o b.sundae --distill --steps 0": "steps is 0; give a whole number, at least 1",
@@ -152,7 +152,7 @@ def inputs(tmp_path_factory):
         (folder / name).write_bytes(header.replace(b"vertex 200", b"vertex %d" % count) + b"end_header\n" + nan)
     path = {"render_width": 41, "render_height": 31, "camera_path": []}
     contents = {"in.bin": b"\x1f\x8b\xff", "damaged.json": b"{", "few.json": json.dumps(path).encode()}
-    contents |= dict.fromkeys(("a.ksplat", "a.lcc", "a.glb", "a.pth", "a.splat", "a.html"), bytes(33))
+    contents |= dict.fromkeys(("a.ksplat", "a.lcc", "a.glb", "a.pth", "a.splat", "page.html"), bytes(33))
     contents |= {"text.mp4": b"not a video", "trained/point_cloud/iteration_30000/point_cloud.ply": b""}
     contents["trained/point_cloud/iteration_7000/point_cloud.ply"] = b""  # written later
     empty = "scene/transforms.json", "model/sparse/0/cameras.bin", "blender/transforms_train.json", "used/thesis.txt"
