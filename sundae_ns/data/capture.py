@@ -33,8 +33,7 @@ def finite(value: Any, name: str, where: str, *, positive: bool = False) -> floa
 
 def side(value: Any, name: str, where: str) -> int:
     """``value`` as the side of an image in pixels; ``DataError`` unless it is a whole number from 1 to 65,535."""
-    length = finite(value, name, where)
-    if length != int(length) or not 1 <= length <= _MAX_SIDE:
+    if (length := finite(value, name, where)) != int(length) or not 1 <= length <= _MAX_SIDE:
         raise DataError(f"{where}: {name} is {value!r:.80}; it must be a whole number of pixels, at most {_MAX_SIDE}")
     return int(length)
 

@@ -125,8 +125,7 @@ def is_srgb(image: Image.Image) -> bool:
 
 def _conversion(image: Image.Image) -> Callable[[Image.Image], Any] | None:
     """A function to sRGB, by what an image states, in the order of the PNG specification; None for those of sRGB."""
-    cicp = image.info.get("cicp")
-    if cicp is None and (profile := image.info.get("icc_profile")) is not None:
+    if (cicp := image.info.get("cicp")) is None and (profile := image.info.get("icc_profile")) is not None:
         transform = _transform(profile, _MODES[image.mode])
         return transform and (lambda base: ImageCms.applyTransform(base.convert(transform.input_mode), transform))
     stated: tuple[float, Any] = 0, 0
@@ -142,8 +141,8 @@ def _conversion(image: Image.Image) -> Callable[[Image.Image], Any] | None:
             nclx = image.info["nclx_profile"]
             stated = int(nclx["transfer_characteristics"]), int(nclx["color_primaries"])
         elif image.format in ("JPEG", "MPO", "TIFF"):
-            adobe = image.getexif().get_ifd(ExifTags.IFD.Interop).get(1) == "R03"
-            stated = _ADOBE if adobe else stated
+            interop, inner = (image.getexif().get_ifd(kind) for kind in (ExifTags.IFD.Interop, ExifTags.IFD.Exif))
+            stated = _ADOBE if interop.get(1) == "R03" or inner.get(ExifTags.Base.ColorSpace) == 2 else stated
     narrow = cicp is not None and cicp[3:] == b"\0"
     if stated[0] not in _LIGHT and stated[1] not in _PRIMARIES and not isinstance(stated[0], float) and not narrow:
         return None

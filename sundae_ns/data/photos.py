@@ -114,7 +114,8 @@ def upright(photo: Photo) -> tuple[Image.Image, Image.Exif]:
             exif = image.getexif()
             pixels = images.turned(images.to_srgb(image), orientation_in(image))
         exif.pop(ExifTags.Base.Orientation, None)
-        exif.get_ifd(ExifTags.IFD.Exif).pop(ExifTags.IFD.Interop, None)  # it may say Adobe RGB
+        for name in (ExifTags.IFD.Interop, ExifTags.Base.ColorSpace):  # which may say Adobe RGB
+            exif.get_ifd(ExifTags.IFD.Exif).pop(name, None)
     return pixels, exif
 
 

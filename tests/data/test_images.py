@@ -131,10 +131,11 @@ def test_a_png_is_read_in_little_memory_whatever_its_chunks_state(tmp_path):
     assert verdict(lambda: decoded(path), len(content)) is None
 
 
-def test_adobe_rgb_by_exif(tmp_path):
-    """Cameras state Adobe RGB by DCF's R03 alone; the photo that is saved states it no more."""
+@pytest.mark.parametrize("stated", [{0xA001: 0xFFFF, 0xA005: {1: "R03"}}, {0xA001: 2}], ids=["R03", "2"])
+def test_adobe_rgb_by_exif(tmp_path, stated):
+    """Cameras state Adobe RGB by DCF's R03 or a number alone; the photo that is saved states it no more."""
     exif = Image.Exif()
-    exif[0x8769] = {0xA001: 0xFFFF, 0xA005: {1: "R03"}}
+    exif[0x8769] = stated
     patches().save(tmp_path / "a.jpg", exif=exif, quality=100, subsampling=0)
     photo = photo_of(tmp_path / "a.jpg")
     with Image.open(photo.path) as image:
