@@ -169,11 +169,12 @@ def _lens(exif: Image.Exif) -> tuple[str, ...]:
 
 
 def masks_of(photos: Sequence[Photo], folder: Path) -> list[Path]:
-    """The mask of each photo: an image in ``folder`` with its name, or with ``.png`` behind it or in its place."""
+    """The mask of each photo, by its name, in ``folder``, the same subfolder there, or a folder so named beside it."""
     masks, root = list[Path](), Path(os.path.commonpath([photo.path.parent for photo in photos]))
     for path, _, wanted, _, _ in photos:
         names = (path.name, f"{path.name}.png", f"{path.stem}.png", f"{path.stem}.jpg")
-        tried = [place / name for place in (folder / path.parent.relative_to(root), folder) for name in names]
+        places = folder / path.parent.relative_to(root), path.parent / folder.name, folder
+        tried = [place / name for place in places for name in names]
         if (mask := next((each for each in tried if each.is_file()), None)) is None:
             raise DataError(f"{path} has no mask {path.stem}.png in {folder}; add it, white where pixels count")
         if mask in masks:

@@ -5,6 +5,7 @@ import os
 import re
 import struct
 import zlib
+from pathlib import Path
 
 import pytest
 from limits import refused
@@ -161,8 +162,9 @@ def test_masks_lie_in_folders_as_their_photos_do(tmp_path):
     photo(tmp_path / "masks" / "0.png", mode="L")
     with pytest.raises(DataError, match=r"b/0\.jpg and another photo have one mask, .*/masks/0\.png; put masks"):
         masks_of(found, tmp_path / "masks")
-    masks = [photo(tmp_path / "masks" / folder / "0.png", mode="L") for folder in "ab"]
-    assert masks_of(found, tmp_path / "masks") == masks
+    for beside in (tmp_path / "photos" / "{}" / "masks", tmp_path / "masks" / "{}"):
+        masks = [photo(Path(str(beside).format(folder), "0.png"), mode="L") for folder in "ab"]
+        assert masks_of(found, tmp_path / "masks") == masks
 
 
 MASKS = {
