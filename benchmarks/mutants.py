@@ -23,6 +23,7 @@ import importlib.util
 import json
 import os
 import random
+import resource
 import sys
 import time
 from collections.abc import Iterator
@@ -44,7 +45,7 @@ from rich.progress import track
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "sundae_ns"
 SECONDS = 120
-"""A changed module counts as noticed if its tests take longer than this: they hang."""
+"""A changed module counts as noticed if its tests take more CPU time than this, or ten times as long: they hang."""
 # Modules below the package, and tests that should notice a change in them; that named like the module runs first.
 ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "pruning": (("pruning/[!_]*.py",), ("pruning/test_*.py", "scene/test_cleaning.py")),
@@ -145,7 +146,7 @@ def noticed(tests: list[str], finder: Changed | None) -> bool:
     # No alarm in the child: tests of bad input set one themselves.
     child = get_context("fork").Process(target=run_tests, args=(tests, finder))
     child.start()
-    child.join(SECONDS)
+    child.join(10 * SECONDS)
     child.kill()  # does nothing to one that has ended
     child.join()
     return child.exitcode != 0
@@ -157,6 +158,7 @@ def run_tests(tests: list[str], finder: Changed | None) -> None:
     if finder is not None:
         sys.meta_path.insert(0, finder)
     os.chdir(ROOT)
+    resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
     os._exit(int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", *tests]) != 0))
 
 
