@@ -66,9 +66,7 @@ def test_an_image_of_the_camera_in_a_file(folder, tmp_path, capsys):
     assert np.abs(pixels(out) - expected).mean() < 10  # of JPEG
     assert run(folder / "cloud.ply", "--camera", camera, "-o", tmp_path / "b.png", "--width", 80) == 0
     assert pixels(tmp_path / "b.png").shape == (60, 80, 3)
-
-
-def test_a_scene_without_cameras_is_seen_from_the_front(folder, tmp_path):
+    # Without a camera it is seen from the front.
     assert run(folder / "cloud.ply", "-o", tmp_path / "a.webp", "--width", 64) == 0
     assert pixels(tmp_path / "a.webp").shape == (48, 64, 3)
 

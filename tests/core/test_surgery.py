@@ -5,6 +5,7 @@ import torch
 from fields import normal_field
 from hypothesis import given
 from hypothesis import strategies as st
+from prunes import train
 from torch import nn
 from torch.nn import Parameter
 from torch.optim import Adam
@@ -23,16 +24,6 @@ def gaussians(n=20):
     params["quats"].requires_grad_(False)
     optimizers = {name: Adam([{"params": params[name], "lr": 0.1}], eps=1e-15) for name in TRAINED}
     return params, {**optimizers, "compensation": Adam(nn.Linear(n, n).parameters())}
-
-
-def train(params, optimizers, steps=1):
-    for _ in range(steps):
-        loss = torch.stack([(value - 1).square().sum() for value in params.values() if value.requires_grad]).sum()
-        for optimizer in optimizers.values():
-            optimizer.zero_grad()
-        loss.backward()
-        for optimizer in optimizers.values():
-            optimizer.step()
 
 
 def moments(optimizers, params, name):

@@ -70,6 +70,10 @@ def test_a_valid_checkpoint_is_read(good, tmp_path):
     path.write_bytes(good)
     assert verdict(lambda: resume(path), len(good)) is None
     assert verdict(lambda: read_gaussians(path), len(good)) is None
+    # Tensors without their bytes are refused.
+    sizes = [entry.file_size for entry in zipfile.ZipFile(io.BytesIO(good)).infolist()]
+    path.write_bytes(INSIDE[".ckpt"](good, lambda _: b"", sizes.index(max(sizes))))
+    refused(resume, path, kind=SundaeError)
 
 
 @pytest.fixture
@@ -96,12 +100,6 @@ def test_a_requested_step_is_not_replaced(folder, step):
     made.config.load_step = step
     error = verdict(made._load_checkpoint, 10**6)
     assert f"step-{step:09d}.ckpt" in str(error)
-
-
-def test_tensors_without_their_bytes(good, tmp_path):
-    sizes = [entry.file_size for entry in zipfile.ZipFile(io.BytesIO(good)).infolist()]
-    (tmp_path / "a.ckpt").write_bytes(INSIDE[".ckpt"](good, lambda _: b"", sizes.index(max(sizes))))
-    refused(resume, tmp_path / "a.ckpt", kind=SundaeError)
 
 
 EXTRA, PARAMETERS = "pipeline/_model._extra_state", "pipeline/_model.gauss_params"

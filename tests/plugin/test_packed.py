@@ -64,11 +64,6 @@ def test_a_packed_scene_becomes_a_model():
     assert (model.config.rasterize_mode, model.config.background_color) == ("antialiased", "white")
 
 
-def test_a_folder_without_a_capture_is_refused(tmp_path):
-    with pytest.raises(DataError, match=str(tmp_path / "gone")):
-        datamanager_of(scene_of(scene()), tmp_path / "gone")
-
-
 @pytest.mark.parametrize(
     "parser",
     [
@@ -88,7 +83,9 @@ def test_the_options_of_a_capture_survive(parser):
     assert vars(found) == vars(parser)
 
 
-def test_captures_that_are_not_described():
+def test_captures_that_are_not_described_or_gone(tmp_path):
+    with pytest.raises(DataError, match=str(tmp_path / "gone")):
+        datamanager_of(scene_of(scene()), tmp_path / "gone")
     elsewhere = ColmapDataParserConfig(images_path=Path("/elsewhere/images"))
     for parser in (BlenderDataParserConfig(alpha_color="pink"), elsewhere):
         assert describe_capture(SundaeDatamanagerConfig(dataparser=parser)) is None

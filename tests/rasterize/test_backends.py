@@ -415,14 +415,7 @@ def test_no_gaussians_are_an_empty_image_and_float64_is_refused():
 SMALL = scene(800), make_view(60, 50)
 
 
-@pytest.fixture
-def threads():
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
-
-
-def test_results_do_not_depend_on_the_number_of_threads(threads, monkeypatch):
+def test_results_do_not_depend_on_the_number_of_threads(monkeypatch):
     for module in ("backend", "tiles", "compositing"):
         monkeypatch.setattr(f"sundae_ns.rasterize.cpu.{module}.MIN_PER_THREAD", 100)
     values, camera = scene(3000), make_view(130, 70)
@@ -435,7 +428,7 @@ def test_results_do_not_depend_on_the_number_of_threads(threads, monkeypatch):
     assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
 
 
-def test_threads_that_rasterise_at_once(threads):
+def test_threads_that_rasterise_at_once():
     """A viewer renders beside a training run."""
     torch.set_num_threads(2)
     alone = render(*SMALL, F32, CPU)
@@ -476,7 +469,7 @@ def test_unsupported_dtypes_are_refused():
         spherical_harmonics(1, torch.ones(2, 3).half(), torch.ones(2, 4, 3).half(), backend=CPU)
 
 
-def test_a_forked_process_runs_compiled_loops(threads):
+def test_a_forked_process_runs_compiled_loops():
     """Data loaders fork; numba's own thread pools would end such a process."""
     torch.set_num_threads(2)
     render(*SMALL, F32, CPU)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial
 
+import torch
 from fields import normal_field
 from torch import Tensor
+from torch.optim import Optimizer
 
 from sundae_ns.core.gaussians import sanitise
 from sundae_ns.graph.graph import NeighborGraph
@@ -16,6 +18,19 @@ from sundae_ns.pruning.rule import PruneRule, band_rule, kept_count
 draws = partial(PruneRule, selection="systematic")
 PAPER = band_rule(PruneRule(signal="positions"), 0.5)
 gaussians = normal_field
+
+
+def train(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer], steps: int = 1) -> float:
+    """Train all values towards 1; the loss before the last step."""
+    loss = torch.zeros(())
+    for _ in range(steps):
+        loss = torch.stack([(value - 1).square().sum() for value in params.values() if value.requires_grad]).sum()
+        for optimizer in optimizers.values():
+            optimizer.zero_grad()
+        loss.backward()
+        for optimizer in optimizers.values():
+            optimizer.step()
+    return loss.item()
 
 
 def decide_share(

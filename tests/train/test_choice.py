@@ -19,6 +19,9 @@ def point(count, psnr_loss=0.0, ssim_loss=0.0, size=None):
 def test_views_count_by_their_pixels():
     rows = [Tried("count", 100, "plain", 9, [[1e-9, 0, 0.9, few], [100, 0, 0.9, 30.0]]) for few in (30.0, 20.0)]
     assert choice.curve_of(rows)[1].psnr_loss == pytest.approx(0, abs=1e-6)
+    # A gain of 1 dB on few pixels does not outweigh a loss on many.
+    plain, head = [[10.0, 20.0, 0.5], [990.0, 20.0, 0.5]], [[10.0, 21.0, 0.6], [990.0, 19.98, 0.6]]
+    assert best_of([plain, head]) == "plain"
 
 
 def test_where_no_count_is_best_in_both_figures_the_one_that_loses_least_is_taken():
@@ -63,9 +66,7 @@ def test_the_gain_of_a_head_in_ssim_is_in_decibels_of_its_distance_from_one():
     assert (gain.psnr, gain.ssim, gain.ssim_db) == pytest.approx((0.5, 0.05, 10 * math.log10(2)))
     assert HeadGain.of(trial(30.0, 0.0), trial(30.5, 0.0)).ssim_db is None
     assert HeadGain.of(trial(30.0, 0.9), trial(30.5, 1.0)).ssim_db is None
-
-
-def test_the_loss_of_held_out_views_is_that_of_training():
+    # The loss of held-out views is that of training.
     assert choice.loss_of([HeldOutQuality(9, 20.0, 0.7)], 0.2) == pytest.approx(0.8 * 0.1 + 0.2 * 0.3)
 
 
@@ -133,12 +134,6 @@ def test_a_candidate_must_gain_over_the_cheaper_ones_and_must_lose_neither_psnr_
 def test_a_candidate_that_takes_more_bytes_must_gain_more(gain, size, best):
     measured = [[[10.0, 20.0, 0.5]], [[10.0, 20.0 + gain, 0.5]]]
     assert best_of(measured, sizes=(100, size, 400)) == best
-
-
-def test_views_of_heads_count_by_their_pixels():
-    # A gain of 1 dB on few pixels does not outweigh a loss on many.
-    plain, head = [[10.0, 20.0, 0.5], [990.0, 20.0, 0.5]], [[10.0, 21.0, 0.6], [990.0, 19.98, 0.6]]
-    assert best_of([plain, head]) == "plain"
 
 
 @pytest.fixture

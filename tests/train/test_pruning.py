@@ -15,23 +15,21 @@ from torch.optim import Adam
 from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.pruning.decision import Pruner
 from sundae_ns.train.initialize import Start
-from sundae_ns.train.pruning import COUNT, UNPRUNED, PruningConfig, ScheduledPruning, prune_when_due, summary
+from sundae_ns.train.pruning import (
+    COUNT,
+    UNPRUNED,
+    PruningConfig,
+    ScheduledPruning,
+    prune_when_due,
+    summary,
+    usual_share,
+)
 from sundae_ns.train.schedules import Decay
 
 
 def gaussians(n=100, seed=0):
     params = {name: Parameter(value) for name, value in prunes.gaussians(n, seed=seed).items()}
     return params, {name: Adam([value], lr=0.01) for name, value in params.items()}
-
-
-def train_step(params, optimizers):
-    for optimizer in optimizers.values():
-        optimizer.zero_grad()
-    loss = torch.stack([value.square().mean() for value in params.values()]).sum()
-    loss.backward()
-    for optimizer in optimizers.values():
-        optimizer.step()
-    return loss.item()
 
 
 def run(config, made, steps, state=None):
@@ -42,7 +40,7 @@ def run(config, made, steps, state=None):
         return made[0]["opacities"].sigmoid().squeeze(1)
 
     for step in steps:
-        train_step(*made)
+        prunes.train(*made)
         reports.append(prune_when_due(config, Pruner(*made), state, step, contribute))
     return [report for report in reports if report is not None], state
 
@@ -54,7 +52,7 @@ def test_one_shot_prunes_once_and_training_goes_on():
         reports, state = run(config, made, range(step, step + 1), state)
         assert bool(reports) == (step == 3)
         if step > 3:
-            losses.append(train_step(*made))
+            losses.append(prunes.train(*made))
         if reports:
             assert tuple(reports[0][name] for name in ("before", "after", "peak")) == (100, 25, 100)
             assert reports[0]["sigma"] is not None
@@ -230,6 +228,8 @@ def test_trials_decide_how_many_stay_and_the_prune_waits_for_them():
         assert config.due(decided, 3, 60)
         assert config.target(60, decided) == kept
     assert config.target(5, {**UNPRUNED, COUNT: 7}) == 5
+    shares = [usual_share(views) for views in (1, 7, 12, 13, 24, 31, 32, 99)]
+    assert shares == pytest.approx([0.05, 0.05, 0.05, 0.13 / 2.4, 0.1, 0.31 / 2.4, 0.1, 0.1])
 
 
 def test_a_prune_in_one_shot_adds_none_that_lack_and_a_cap_may_be_the_target():
