@@ -97,8 +97,7 @@ def merge(scenes: Iterable[Scene]) -> Scene:
     >>> len(sn.merge([scene, sn.transform(scene, translation=(2, 0, 0))]))
     100
     """
-    scenes = list(scenes)
-    if not scenes or not all(isinstance(scene, Scene) for scene in scenes):
+    if not (scenes := list(scenes)) or not all(isinstance(scene, Scene) for scene in scenes):
         raise DataError("merge found no scenes; give a list of them")
     first, encodings = scenes[0], {scene.gaussians.encoding for scene in scenes}
     if not all(_same(first.head, scene.head) for scene in scenes):
@@ -209,8 +208,7 @@ def floater_mask(
     """True for floaters, bool ``[N]``; arguments and errors as for :func:`remove_floaters`."""
     if not 0 <= strength <= 1:
         raise ConfigError(f"the strength of remove-floaters is {strength}; give 0 (careful) to 1 (thorough)")
-    sanitised = sanitise(scene.gaussians)
-    if not sanitised.gaussians.num_gaussians:
+    if not (sanitised := sanitise(scene.gaussians)).gaussians.num_gaussians:
         raise DataError("no Gaussian is finite; export the scene again")
     floats = floater_odds(sanitised.gaussians) > 6.5 - 5 * strength  # logarithms
     if cameras:

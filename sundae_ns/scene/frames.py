@@ -95,8 +95,7 @@ def late_outputs(
         return feature_colors(image, *principal_components(gaussians[FEATURES]), alpha)
 
     def response_image() -> Tensor:
-        shown = values()
-        if shown is None:
+        if (shown := values()) is None:
             return torch.zeros_like(alpha)
         return splat(drawn, camera, (shown if mask is None else shown[mask])[:, None], settings).colors
 
@@ -186,8 +185,7 @@ class FrameReplay:
     ) -> dict[str, Any] | None:
         record_frame = partial(_record, source, camera, background, settings)
         key = self._key(source, camera, settings)
-        frame = self._frames.get(key, record_frame)
-        if frame is None:
+        if (frame := self._frames.get(key, record_frame)) is None:
             return None
         images, needed = _replay(frame, camera, background)
         if needed > frame.capacity:

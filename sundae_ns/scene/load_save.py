@@ -57,8 +57,7 @@ def load(path: Path | str, *, device: torch.device | str = "cpu") -> Scene:
 
 def load_with_mask(path: Path, device: torch.device | str = "cpu") -> tuple[Scene, Tensor | None]:
     """As :func:`load`, with True for the Gaussians of a file that the scene has, bool ``[N]``; None for others."""
-    kind = kind_of(path)
-    if kind == "packed" or (kind is None and path.suffix.lower() == ".sundae"):
+    if (kind := kind_of(path)) == "packed" or (kind is None and path.suffix.lower() == ".sundae"):
         from sundae_ns.io.pack.packed_scene import read_scene
         from sundae_ns.scene.packing import scene_of  # its decoder needs a compiler, which other files do not
 

@@ -29,8 +29,7 @@ _PROPERTIES: dict[str, Any] = FORMAT["header"]["properties"]
 def scene_of(packed: PackedScene) -> Scene:
     """The scene of a packed file's contents, on the CPU; ``PackError`` for an impossible model, or another head."""
     stated: dict[str, Any] = packed.meta.get("model")  # type: ignore[assignment]
-    wrong = fault(stated, _MODEL, "model")
-    if wrong is not None:
+    if (wrong := fault(stated, _MODEL, "model")) is not None:
         raise refusal(f"no valid {wrong}")
     degree, focal = int(stated["sh_degree"]), stated.get("trained_focal")
     if packed.gaussians["features_rest"].shape[1] > (degree + 1) ** 2 - 1:

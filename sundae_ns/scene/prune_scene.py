@@ -251,8 +251,7 @@ def count_for_drop(
         pruned = prune_with_mask(scene, None, n // 2, trained, rule, progress=True).scene
         psnr = measure(pruned, scene, held_out, head=False).psnr
         curve.append((n // 2, psnr))
-        error = 10 ** (-psnr / 10)
-        if error > tolerated:
+        if (error := 10 ** (-psnr / 10)) > tolerated:
             # The error is about a power of the count, so a straight line in its logarithm; from no error it is not.
             scale = math.log if before else float
             low, aim, high = (scale(max(value, 1e-10 if before else 0.0)) for value in (before, tolerated, error))
@@ -396,8 +395,7 @@ def largest(
     (low, high), best, before = powers, None, None
     for _ in range(MOST_FILES):
         made = at(power)
-        size = bytes_of(made)
-        if size <= most:
+        if (size := bytes_of(made)) <= most:
             high, best = power, made
         else:
             low = power

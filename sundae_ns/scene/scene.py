@@ -271,8 +271,7 @@ def initial_features(features_dc: Tensor, num_features: int, generator: torch.Ge
 def unit(direction: AnyArray) -> Direction:
     """A direction scaled to unit length; ``ConfigError`` for one without a direction."""
     x, y, z = numbers(direction, "the up axis", (3,)).tolist()
-    length = math.hypot(x, y, z)
-    if not length:
+    if not (length := math.hypot(x, y, z)):
         raise ConfigError("the up axis has no direction; give 0 0 1 for z")
     return x / length, y / length, z / length
 
@@ -283,11 +282,22 @@ def usable_cameras(cameras: Any) -> tuple[Camera, ...]:
     for camera in listed:
         if not isinstance(camera, Camera):
             raise DataError(f"{str(camera)[:80]!r} is no camera; give a Camera, or those of cameras_of(path)")
-        for matrix, side in zip(camera[:2], (4, 3), strict=True):  # on a GPU, values would be waited for
-            fits = isinstance(matrix, Tensor) and matrix.shape == (side, side) and matrix.dtype == torch.float32
-            if not fits or (matrix.device.type == "cpu" and not bool(matrix.isfinite().all())):
-                raise DataError("the matrices of a camera are no finite tensors, float32; make it by Camera.from_pose")
+        for matrix, side in zip(camera[:2], (4, 3), strict=True):
+            if not isinstance(matrix, Tensor) or matrix.shape != (side, side) or matrix.dtype != torch.float32:
+                raise DataError("the matrices of a camera are no float32 tensors; make it by Camera.from_pose")
+    on_cpu = [camera[:2] for camera in listed if camera.K.device.type == "cpu"]  # the values of others are waited for
+    if on_cpu and not _are_pinholes(*(torch.stack(each).detach() for each in zip(*on_cpu, strict=True))):
+        raise DataError("a camera is no pinhole without skew, with a finite rotation; make it by Camera.from_pose")
     return listed
+
+
+def _are_pinholes(views: Tensor, K: Tensor) -> bool:
+    """Whether matrices ``[V, 4, 4]`` and ``[V, 3, 3]`` are of such a form that rasterisers read all of them."""
+    axes, eye = views[:, :3, :3], torch.eye(4, device="cpu")
+    plain = torch.equal(K * K.new_tensor([[1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]]), K)
+    turned = ((axes @ axes.mT - eye[:3, :3]).abs() < 0.25).all() & (axes.det() > 0).all() & views.isfinite().all()
+    last = (views[:, 3] == eye[3]).all() & (K[:, 2, 2] == 1).all()
+    return plain and bool(turned & last & (K.diagonal(dim1=1, dim2=2) > 0).all())
 
 
 def within(mask: Tensor, inner: Tensor) -> Tensor:

@@ -137,8 +137,7 @@ def middle_and_reach(gaussians: Gaussians) -> tuple[Tensor, float]:
     """Median of the centres ``[3]``, float64 on the CPU, and their median distance from it; in one place, a size."""
     means = gaussians["means"].double()
     middle = means.median(dim=0).values
-    reach = float((means - middle).norm(dim=1).median())
-    if reach == 0:
+    if (reach := float((means - middle).norm(dim=1).median())) == 0:
         reach = 3 * float(gaussians["scales"].double().amax(dim=1).median().exp())
     return middle.cpu(), max(reach, 1e-30)
 

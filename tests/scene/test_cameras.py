@@ -416,7 +416,7 @@ def test_options_name_a_view_or_a_file(tmp_path):
 
 def test_values_that_readers_refuse_are_not_written(tmp_path):
     far = sn.Camera.look_at((2e9, 0, 0), (0, 0, 0))
-    for wrong in (far, far._replace(viewmat=torch.zeros(4, 4)), far.zoomed(1e6)):
+    for wrong in (far, far.zoomed(1e6)):
         with pytest.raises(ConfigError, match="has values that readers refuse"):
             sn.save(two_seen(start=wrong), tmp_path / "a.sundae")
     assert not list(tmp_path.iterdir())
