@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+from collections import Counter
 from functools import cache
 from pathlib import Path
 
@@ -94,11 +95,10 @@ def circles(edges):
 
 def lines_of_rooms():
     """Lines of each room; the package's first module and ``method_configs`` are its front."""
-    lines = {}
+    lines = Counter()
     for name, path in modules().items():
         room = room_of(name)
-        room = "front" if room in (None, "method_configs") else room
-        lines[room] = lines.get(room, 0) + len(path.read_text().splitlines())
+        lines["front" if room in (None, "method_configs") else room] += len(path.read_text().splitlines())
     return lines
 
 
@@ -129,19 +129,13 @@ def test_file_names_are_told_apart():
     assert len(twins) <= MAX_TWINS, twins
 
 
-def test_rooms_import_only_lower_floors():
+def test_rooms_import_only_lower_floors_in_no_circle_and_only_the_plugin_imports_nerfstudio():
     assert not {
         module: rooms
         for module, names in imports().items()
         if (room := room_of(module)) is not None and (rooms := violations(room, names))
     }
-
-
-def test_no_module_is_on_a_circle():
     assert not circles(imports())
-
-
-def test_only_the_plugin_imports_nerfstudio():
     below = {name: names for name, names in imports().items() if room_of(name) not in ("plugin", "method_configs")}
     assert not [name for name, names in below.items() if any(each.split(".")[0] == "nerfstudio" for each in names)]
 

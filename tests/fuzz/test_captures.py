@@ -332,8 +332,7 @@ def train_a_step(data):
     datamanager = load(data)
     metadata = datamanager.train_dataset.metadata
     points = [metadata[f"points3D_{name}"] for name in ("xyz", "rgb") if "points3D_xyz" in metadata]
-    model = _build(seed_points=points or None, metadata=metadata, num_random=50)
-    model.train()
+    model = _build(seed_points=points or None, metadata=metadata, num_random=50).train()
     model.step = 4
     camera, batch = datamanager.next_train(0)
     outputs = model(camera)

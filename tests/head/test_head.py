@@ -125,15 +125,12 @@ def test_inside_the_image(width, height, limit, seed):
     assert crop.width * crop.height <= limit or min(crop.width, crop.height) <= 16
 
 
-def test_windows_follow_the_seed_keep_the_aspect_and_use_the_limit():
+def test_windows_follow_the_seed_keep_the_aspect_use_the_limit_and_often_see_both_edges():
     assert training_crop(10_000, 10_000, 0, seed=1) is None
     crop, again, other = (training_crop(1061, 1893, 2**20, seed) for seed in (3, 3, 4))
     assert crop == again != other
     assert crop.width / crop.height == pytest.approx(1061 / 1893, rel=0.03)
     assert 0.95 * 2**20 < crop.width * crop.height <= 2**20
-
-
-def test_both_edges_are_seen_often():
     seen = np.zeros(1000)
     for crop in (training_crop(1000, 1000, 490_000, seed) for seed in range(2000)):
         seen[crop.left : crop.left + crop.width] += 1

@@ -168,18 +168,15 @@ def test_the_most_alike_pair_merges_first():
     assert labels.tolist() == [1, 1, 2, 3]
 
 
-def test_equal_pairs_merge_many_at_once():
+def test_equal_pairs_merge_many_at_once_and_all_at_one_place_or_with_one_that_overflows_end(monkeypatch):
     """All pairs of a chain cost the same; in their own order only the first would be the cheapest of both ends."""
     gaussians = row(*[0.0] * 256)
     first = torch.arange(255)
     groups = merge._Groups(gaussians, torch.ones(256), torch.device("cpu"))
     chosen = merge._cheapest_of_both((first, first + 1), groups.cost(first, first + 1), 256)
     assert len(chosen) > 50
-
-
-def test_clones_that_share_their_neighbours_and_a_gaussian_that_overflows_end(monkeypatch):
     monkeypatch.setattr(merge, "MOST_ROUNDS", 3)
-    assert prune_gaussians(row(*[0.0] * 256), PAIRS, 64, torch.ones(256)).gaussians.num_gaussians == 64
+    assert prune_gaussians(gaussians, PAIRS, 64, torch.ones(256)).gaussians.num_gaussians == 64
     gaussians = points()
     gaussians["scales"][5] = 400.0  # it overflows
     assert prune_gaussians(gaussians, PAIRS, 40, torch.ones(400)).gaussians.num_gaussians == 40

@@ -89,8 +89,7 @@ def test_the_view_of_a_training_camera_is_made_once(build, camera, batch, monkey
 
 @pytest.mark.parametrize("mode", ["residual", "features"])
 def test_head_and_field_learn_together(build, perturb, camera, batch, mode):
-    model = perturb(build(head={"mode": mode}))
-    model.train()
+    model = perturb(build(head={"mode": mode})).train()
     outputs = model.get_outputs(camera())
     losses = model.get_loss_dict(outputs, batch())
     assert set(losses) == {"main_loss", "base_loss"}
@@ -103,8 +102,7 @@ def test_head_and_field_learn_together(build, perturb, camera, batch, mode):
 
 
 def test_masked_pixels_do_not_count(build, perturb, camera, batch):
-    model = perturb(build(ssim_lambda=0.0))
-    model.eval()
+    model = perturb(build(ssim_lambda=0.0)).eval()
     outputs, target = model.get_outputs(camera()), batch()
     mask = torch.zeros(32, 40, 1, dtype=torch.bool)
     mask[:, :20] = True
@@ -119,8 +117,7 @@ def test_masked_pixels_do_not_count(build, perturb, camera, batch):
 
 @pytest.mark.parametrize("term", ["rms", "l1"])
 def test_after_the_prune_the_root_of_the_mean_square_takes_the_place_of_l1(build, perturb, camera, batch, term):
-    model = perturb(build(loss_after_prune=term))
-    model.eval()
+    model = perturb(build(loss_after_prune=term)).eval()
     outputs, target = model.get_outputs(camera()), batch()
     error = outputs["rgb"] - target["image"].float() / 255
     l1, rms = error.abs().mean(), error.square().mean().sqrt()
@@ -137,8 +134,7 @@ def test_after_the_prune_the_root_of_the_mean_square_takes_the_place_of_l1(build
 
 def test_a_pruned_field_has_a_prior_that_counts_once(build, perturb, camera, batch):
     """Twice as many training images halve its weight in the loss of one."""
-    model = perturb(build(prior_after_prune=0.6))
-    model.eval()
+    model = perturb(build(prior_after_prune=0.6)).eval()
     outputs, target = model.get_outputs(camera()), batch()
     assert "opacity_loss" not in model.get_loss_dict(outputs, target)
     model.state.pruning["num_prunes"] = 1
