@@ -119,7 +119,6 @@ def compare(
         write_files({out / f"report.{kind}": text.encode(errors="backslashreplace") for kind, text in files.items()})
         print(f"wrote {out / 'report.html'}, for a browser ({len(page) / 1e6:.1f} MB), report.md, .csv and .json")
     least = -math.inf if min_psnr is None else min_psnr
-    low = [run.label for run in runs if run.full.views and not (run.full.mean("psnr") or 0) >= least]
-    if low:
+    if low := [run.label for run in runs if run.full.views and not (run.full.mean("psnr") or 0) >= least]:
         print(f"below {min_psnr:g} dB: {', '.join(low)}", file=sys.stderr)
     return 1 if failures or low else 0

@@ -52,8 +52,7 @@ def doctor(compile: Flag = False) -> int:  # noqa: A002
         missing = "[red]missing[/]" if part.name in PACKAGES else "[yellow]-[/]"  # training needs these
         table.add_row("[green]ok[/]" if part.works else missing, part.name, escape(part.text))
     console.print(table)
-    remedies = [f"  {part.name}: {part.remedy}" for part in checked if not part.works]
-    if remedies:
+    if remedies := [f"  {part.name}: {part.remedy}" for part in checked if not part.works]:
         console.print("\n".join(["\nTo fix:", *remedies]), soft_wrap=True, highlight=False, markup=False)
     return int(any(part.name in PACKAGES and not part.works for part in checked))
 
@@ -135,8 +134,7 @@ def _gsplat(compile_kernels: bool) -> str:
 
 def kernels_built() -> bool:
     """Whether gsplat's CUDA extension is installed or was built before; builds nothing."""
-    spec = importlib.util.find_spec("gsplat")
-    if spec is None or spec.origin is None:
+    if (spec := importlib.util.find_spec("gsplat")) is None or spec.origin is None:
         return False
     root = Path(os.environ.get("TORCH_EXTENSIONS_DIR") or Path(torch.hub.get_dir()).parents[1] / "torch_extensions")
     return any(Path(spec.origin).parent.glob("csrc*")) or any(root.glob("**/gsplat_cuda.so"))

@@ -12,6 +12,7 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 from difflib import get_close_matches
+from tempfile import gettempdir
 from typing import NoReturn
 
 from sundae_ns.core.errors import ConfigError, SundaeError, writing
@@ -60,6 +61,11 @@ def _dispatch(words: Sequence[str]) -> int:
     if name not in COMMANDS:
         near = get_close_matches(name, COMMANDS, n=1)
         raise ConfigError(f"there is no command {name}; {f'use {near[0]}' if near else 'sundae --help lists them'}")
+    try:
+        gettempdir()  # else libraries fail at their import
+    except FileNotFoundError as error:
+        remedy = "make room in /tmp, or set TMPDIR to another folder"
+        raise ConfigError(f"no folder for temporary files can be written; {remedy}") from error
     import tyro
 
     if (flag := "--remove-floaters") in options:  # its number may be left out

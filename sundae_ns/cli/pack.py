@@ -62,8 +62,7 @@ def pack(
     if wishes.cleans and (finetune or target_drop is not None):
         raise ConfigError(f"--finetune and --target-drop need the whole scene; leave out {wishes.cleans[0]}, or them")
     check_file(out, reads=[*files_of(run), advanced.data, advanced.cameras], overwrite=advanced.overwrite)
-    kind = kind_of_gaussians(run)
-    if kind is None:
+    if (kind := kind_of_gaussians(run)) is None:
         check_run(run)
     elif of_photos := words_of(advanced, "finetune", "target_drop", "data"):
         raise ConfigError(f"{run} is a {PRIMITIVES[kind]} without photos; leave out {of_photos[0]}, or give a run")

@@ -136,8 +136,7 @@ class Project:
 
     def _trained(self) -> bool:
         """Whether the last step is saved, of those before the pack's fine-tune."""
-        left = steps_left(self.run)
-        if left is None or left <= 0:
+        if (left := steps_left(self.run)) is None or left <= 0:
             return left is not None
         return self.tunes and left <= tuned_steps(schedule_length(self.run / "config.yml"))
 
@@ -190,8 +189,7 @@ def carry_out(project: Project) -> int:
             if later.result is not None:
                 later.result.unlink(missing_ok=True)
         print(f"{heading}:", flush=True)
-        code = step.run()
-        if code:
+        if code := step.run():
             said = f"{step.name} ended with {code}, as the lines above say; mend that, and the same command continues"
             if code in STOPPED:
                 said = "interrupted; the same command continues here"

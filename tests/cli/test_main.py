@@ -4,12 +4,13 @@ import io
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
 import torch
-from command_line import run
+from command_line import refusal, run
 
 import sundae_ns as sn
 from sundae_ns.cli import main
@@ -32,6 +33,12 @@ def test_what_a_newcomer_types(words, code, says, capsys):
     printed = capsys.readouterr()
     assert says in printed.out
     assert not printed.err
+
+
+def test_no_folder_for_temporary_files(monkeypatch, capsys):
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setattr(tempfile, "_candidate_tempdir_list", list)
+    assert "no folder for temporary files can be written; make room" in refusal(capsys, "info", "a.ply")
 
 
 def test_other_errors_are_not_hidden(monkeypatch):
