@@ -162,6 +162,9 @@ def test_instances_are_nodes_of_their_own(tmp_path):
     instances, separate = read_glb(tmp_path / "a.glb")[0], read_glb(tmp_path / "b.glb")[0]
     assert len(instances["means"]) == 60
     assert_close(instances, separate, dict.fromkeys(SPLAT_NAMES, 1e-5))
+    document["accessors"][-1]["count"] = 1
+    write(tmp_path / "a.glb", document, binary)
+    refused(read_glb, tmp_path / "a.glb", "or have unequal accessors")
 
 
 def test_a_spz_inside(tmp_path):
