@@ -82,9 +82,8 @@ def pair_labels(params: Mapping[str, Tensor], graph: NeighborGraph, weight: Tens
         return label
 
     groups = _Groups(values, w / w.mean().clamp_min(torch.finfo(torch.float64).tiny) + FLOOR, device)
-    first, second = label[:, None].expand_as(graph.indices).flatten(), label[graph.indices].flatten()
-    usable = (first >= 0) & (second >= 0)
-    pairs = _unique(first[usable], second[usable], n)
+    near = label.index_select(0, graph.indices.flatten())
+    pairs: tuple[Tensor, ...] = _unique((label[:, None].expand_as(graph.indices).flatten(), near), n)
     cost = groups.cost(*pairs)
     for _ in range(MOST_ROUNDS):
         if left == count or not len(cost):
@@ -99,10 +98,11 @@ def pair_labels(params: Mapping[str, Tensor], graph: NeighborGraph, weight: Tens
         # Only pairs of a changed group change.
         changed = torch.zeros(n, dtype=torch.bool, device=device)
         changed[stays] = changed[goes] = True
-        moved = changed[pairs[0]] | changed[pairs[1]]
-        renewed = _unique(target[pairs[0][moved]], target[pairs[1][moved]], n)
-        cost = torch.cat([cost[~moved], groups.cost(*renewed)])
-        pairs = torch.cat([pairs[0][~moved], renewed[0]]), torch.cat([pairs[1][~moved], renewed[1]])
+        moved = changed.index_select(0, pairs[0]) | changed.index_select(0, pairs[1])
+        rest, moved = (mask.nonzero().squeeze(1) for mask in (~moved, moved))
+        renewed = _unique(tuple(target.index_select(0, ends.index_select(0, moved)) for ends in pairs), n)
+        cost = torch.cat([cost.index_select(0, rest), groups.cost(*renewed)])
+        pairs = tuple(torch.cat([old.index_select(0, rest), new]) for old, new in zip(pairs, renewed, strict=True))
     if left > count:  # of islands without a bridge, and of clones, the heaviest stay
         heads = (label == torch.arange(n, device=device)).nonzero().squeeze(1)
         lightest = heads[torch.sort(groups.weight[heads], stable=True).indices[: left - count]]
@@ -124,10 +124,10 @@ class _Groups:
     def cost(self, first: Tensor, second: Tensor) -> Tensor:
         """Cost of the merge of each pair ``[P]``."""
         unlike = 1 - overlap(self.mean, self.entries, first, second)
-        unlike += (self.color[first] - self.color[second]).square().sum(dim=1)
+        unlike += (self.color.index_select(0, first) - self.color.index_select(0, second)).square().sum(dim=1)
         # Of equal pairs, as in a grid of equal points, a random one is the cheapest; else a round would merge few.
         unlike += 1e-9 * ((first * 2_654_435_761 + second * 40_503) % 1_000_003).float() / 1_000_003
-        return unlike / (1 / self.weight[first] + 1 / self.weight[second])
+        return unlike / (1 / self.weight.index_select(0, first) + 1 / self.weight.index_select(0, second))
 
     def join(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
         """Merge pairs without a common group; returns the rows that stay and those that go."""
@@ -144,20 +144,20 @@ class _Groups:
         return stays, goes
 
 
-def _unique(first: Tensor, second: Tensor, n: int) -> tuple[Tensor, Tensor]:
-    """Each pair of two different groups once, the lower index first."""
-    apart = first != second
-    first, second = first[apart], second[apart]
-    keys = torch.unique(torch.minimum(first, second) * n + torch.maximum(first, second))
+def _unique(ends: tuple[Tensor, ...], n: int) -> tuple[Tensor, Tensor]:
+    """Each pair of two different groups once, the lower index first; none of a negative index."""
+    # All of pairs is picked by index_select: a CPU takes twice as long by brackets.
+    low, high = torch.minimum(*ends), torch.maximum(*ends)
+    keys = torch.unique((low * n + high).masked_select((low >= 0) & (low < high)))
     return keys.div(n, rounding_mode="floor"), keys % n
 
 
-def _cheapest_of_both(pairs: tuple[Tensor, Tensor], cost: Tensor, n: int) -> Tensor:
+def _cheapest_of_both(pairs: tuple[Tensor, ...], cost: Tensor, n: int) -> Tensor:
     """Indices of the pairs that cost less than all others of both of their groups, cheapest first."""
     least = cost.new_full((n,), torch.inf)
     for ends in pairs:
         least.scatter_reduce_(0, ends, cost, "amin")
-    found = ((cost <= least[pairs[0]]) & (cost <= least[pairs[1]])).nonzero().squeeze(1)
+    found = (cost <= torch.minimum(*(least.index_select(0, ends) for ends in pairs))).nonzero().squeeze(1)
     found = found[torch.sort(cost[found], stable=True).indices]
     # Pairs of exactly equal cost may share a group: the earlier one has it.
     place = torch.arange(len(found), device=cost.device)

@@ -19,6 +19,7 @@ from sundae_ns.io.pack.container import FORMAT, fault
 from sundae_ns.io.pack.packed_scene import PackedScene
 from sundae_ns.rasterize.reference import harmonic_basis
 from sundae_ns.scene.cameras import is_frame, spread
+from sundae_ns.scene.prune_scene import at_most
 from sundae_ns.scene.render import GaussianSource, render_view
 from sundae_ns.scene.scene import Scene, unit
 
@@ -59,8 +60,7 @@ def scene_of(packed: PackedScene) -> Scene:
 
 def contents_of(scene: Scene) -> PackedScene:
     """The contents of a packed file for the finite Gaussians of a scene, with how much its cameras see of errors."""
-    scene = scene.to("cpu")
-    scene = replace(scene, gaussians=sanitise(scene.gaussians).gaussians)
+    scene = replace(scene, gaussians=sanitise(scene.gaussians).gaussians).to("cpu")
     head = {} if scene.head is None else dict(scene.head.state_dict())
     gaussians = {name: value.detach() for name, value in scene.gaussians.items() if name != FEATURES or head}
     stated = _MODEL["properties"]["head"]["required"]
@@ -140,8 +140,7 @@ def sensitivity_of(scene: Scene, cameras: Sequence[Camera]) -> Sensitivity:
     rows = {}
     degree = scene.gaussians.sh_degree if scene.gaussians.encoding == "harmonics" else 0
     if degree > 0:
-        form = _of_harmonics(scene.gaussians["means"].detach(), cameras, degree)
-        rows["features_rest"] = torch.kron(form, torch.eye(3))
+        rows["features_rest"] = _of_harmonics(scene.gaussians["means"].detach(), cameras, degree).kron(torch.eye(3))
     head: dict[str, Tensor] = {}
     if scene.head is not None:
         rows[FEATURES], head = _of_head(scene, cameras)
@@ -174,10 +173,7 @@ def _of_head(scene: Scene, cameras: Sequence[Camera]) -> tuple[Tensor, dict[str,
     squares = {name: torch.zeros(value.shape[:2], dtype=torch.float64) for name, value in weights.items()}
     signs = torch.Generator().manual_seed(0)
     for i in spread(len(cameras), 8):
-        camera = cameras[i]
-        if camera.width * camera.height > 1 << 17:
-            camera = camera.zoomed((2**17 / (camera.width * camera.height)) ** 0.5)
-        image = render_view(source, camera, scene.background, settings, depth=False)[0]["rgb"]
+        image = render_view(source, at_most(cameras[i], 1 << 17), scene.background, settings, depth=False)[0]["rgb"]
         random = torch.randint(0, 2, image.shape, generator=signs) * 2.0 - 1
         of_features, *grads = torch.autograd.grad((image * random).sum(), [features, *weights.values()])
         form += of_features.double().T @ of_features.double()

@@ -203,7 +203,7 @@ def refit(
         with torch.no_grad():
             truths.update(zip(new, _blended(full, [cameras[i] for i in new], settings), strict=True))
         rendered = zip(_blended(gaussians, [cameras[i] for i in chosen], settings), chosen, strict=True)
-        return torch.stack([(image - truths[i]).square().mean() for image, i in rendered]).sum()
+        return torch.stack([torch.nn.functional.mse_loss(image, truths[i].to(image)) for image, i in rendered]).sum()
 
     with Progress(transient=True, console=console, disable=console is None) as progress:
         for i in progress.track(range(steps), description="Refit of Gaussians"):

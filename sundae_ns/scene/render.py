@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -178,12 +179,10 @@ def may_be_seen(means: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, siz
     sides = torch.cat([Ks[:, :2], -Ks[:, :2]], dim=1)
     sides[:, :, 2] = torch.cat([off_axis, -off_axis], dim=1) - (sizes / 2 + 3 * (2 * BLUR) ** 0.5 + 2).repeat(1, 2)
     planes = sides @ viewmats[:, :3]  # [R, 4, 4]: how far beyond each side, times z
-    beyond = means @ planes[..., :3].flatten(0, 1).T + planes[..., 3].flatten()
-    allowed = scales.amax(dim=1).exp()[:, None, None] * reach[:, None]
-    depths = means @ viewmats[:, 2, :3].T + viewmats[:, 2, 3]
+    beyond = (planes[..., :3].flatten(0, 1) @ means.T + planes[..., 3].reshape(-1, 1)).unflatten(0, (-1, 4))
+    over = beyond - (torch.stack(scales.unbind(dim=1)).amax(dim=0).exp() * reach[:, None])[:, None]
     # NaN compares as visible in the sides, where backends disagree, but not in depth, where none renders it.
-    outside = (beyond.view(len(means), len(sizes), 4) > allowed).any(dim=2)
-    return ((depths >= NEAR_PLANE) & ~outside).T
+    return (viewmats[:, 2, :3] @ means.T + viewmats[:, 2, 3:] >= NEAR_PLANE) & ~(over.amax(dim=1) > 0)
 
 
 @torch.no_grad()
@@ -207,31 +206,38 @@ def contribution(
     from rich.progress import track  # takes 20 ms, which a render without a prune need not spend
 
     total, label = source.gaussians["means"].new_zeros(source.gaussians.num_gaussians), "Contribution of Gaussians"
-    for camera, mask in track(cameras, label, transient=True, console=console, disable=console is None):
+
+    @torch.no_grad()
+    def of_view(view: tuple[Camera, Tensor | None]) -> tuple[Any, Tensor, Any]:  # rows, their weights, and the image
+        camera, mask = view
         if mask is not None and tuple(mask.shape) != (camera.height, camera.width, 1):
             size = f"{camera.width} x {camera.height}"
             raise DataError(f"a mask is {list(mask.shape)} but its view is {size} px; give masks of their images' size")
-        seen, rows = source, None
-        if total.device.type == "cpu":  # a GPU culls faster than it picks rows
-            view = camera.viewmat[None], camera.K[None], torch.tensor([[camera.width, camera.height]])
-            (rows,) = may_be_seen(source.gaussians["means"], source.gaussians["scales"], *view)
-            seen = GaussianSource(source.gaussians.rows(rows))
+        rows: Any = ...
+        if total.is_cpu:  # a GPU culls faster than it picks rows
+            pose = camera.viewmat[None], camera.K[None], torch.tensor([[camera.width, camera.height]])
+            rows = may_be_seen(source.gaussians["means"], source.gaussians["scales"], *pose)[0].nonzero().squeeze(1)
+        seen = GaussianSource(source.gaussians.rows(rows)) if total.is_cpu else source
         pixels = None if mask is None else mask[..., 0].to(total)
         if count is None:
-            weights = blending_weights(pass_inputs(seen.gaussians, camera, settings), pixels, backend=settings.backend)
-        else:
-            # As in blending_weights, but one pass gives the image and the weights: the gradient of the first channel.
-            primitives = seen.primitives(camera, settings, features=False)
-            fixed = {name: value.detach() for name, value in primitives.items()}
-            colors = fixed["colors"].requires_grad_()
-            with torch.enable_grad():
-                drawn, splatted = draw(fixed, camera, background.to(total), replace(settings, head=None), depth=False)
-                # A prune keeps the same share of the visible Gaussians as of all.
-                cells = count / source.total * float((splatted.radii > 0).sum())
-                detail = pixel_detail(drawn["base_rgb"].detach(), cells)
-                blended = (splatted.colors[..., 0] * (detail if pixels is None else detail * pixels)).sum()
-            weights = torch.autograd.grad(blended, colors)[0][:, 0]
+            inputs = pass_inputs(seen.gaussians, camera, settings)
+            return rows, blending_weights(inputs, pixels, backend=settings.backend), None
+        # As in blending_weights, but one pass gives the image and the weights: the gradient of the first channel.
+        fixed = {name: value.detach() for name, value in seen.primitives(camera, settings, features=False).items()}
+        colors = fixed["colors"].requires_grad_()
+        with torch.enable_grad():
+            drawn, splatted = draw(fixed, camera, background.to(total), replace(settings, head=None), depth=False)
+            # A prune keeps the same share of the visible Gaussians as of all.
+            cells = count / source.total * float((splatted.radii > 0).sum())
+            detail = pixel_detail(drawn["base_rgb"].detach(), cells)
+            blended = (splatted.colors[..., 0] * (detail if pixels is None else detail * pixels)).sum()
+        image = None if images is None else torch.cat([splatted.colors.detach(), splatted.alpha.detach()], dim=2).half()
+        return rows, torch.autograd.grad(blended, colors)[0][:, 0], image
+
+    with ThreadPoolExecutor(2) as pool:  # parts of a view take but one core of a CPU, so two views share the others
+        views = (pool.map if total.is_cpu else map)(of_view, cameras)
+        for rows, new, image in track(views, label, len(cameras), transient=True, console=console, disable=not console):
+            total[rows] += new
             if images is not None:
-                images.append(torch.cat([splatted.colors.detach(), splatted.alpha.detach()], dim=2).half())
-        total[... if rows is None else rows] += weights
+                images.append(image)
     return total

@@ -302,9 +302,7 @@ def _are_pinholes(views: Tensor, K: Tensor) -> bool:
 
 def within(mask: Tensor, inner: Tensor) -> Tensor:
     """Apply a mask ``inner`` ``[M]`` to the M true entries of a mask ``[N]``."""
-    narrowed = mask.clone()
-    narrowed[mask] = inner
-    return narrowed
+    return mask.masked_scatter(mask, inner)
 
 
 class Rendering(NamedTuple):
