@@ -19,9 +19,9 @@ from sundae_ns.io.pack.container import FORMAT, fault
 from sundae_ns.io.pack.packed_scene import PackedScene
 from sundae_ns.rasterize.reference import harmonic_basis
 from sundae_ns.scene.cameras import is_frame, spread
-from sundae_ns.scene.prune_scene import at_most
 from sundae_ns.scene.render import GaussianSource, render_view
 from sundae_ns.scene.scene import Scene, unit
+from sundae_ns.scene.virtual_cameras import at_most
 
 _MODEL: dict[str, Any] = FORMAT["model"]
 _PROPERTIES: dict[str, Any] = FORMAT["header"]["properties"]

@@ -33,7 +33,7 @@ from sundae_ns.pruning.rule import PruneRule, kept_count
 from sundae_ns.rasterize.interface import rasterize_cameras
 from sundae_ns.scene.render import GaussianSource, RenderSettings, contribution, pass_inputs
 from sundae_ns.scene.scene import Scene, measure, render, usable_cameras, within
-from sundae_ns.scene.virtual_cameras import by_device, of_unit_size, resized, split, virtual_cameras
+from sundae_ns.scene.virtual_cameras import at_most, by_device, of_unit_size, resized, split, virtual_cameras
 
 REFIT = {"cpu": (192, 1, 0.7), "cuda": (128, 4, 1.0)}  # steps of a refit, images of each, and factor of its rates
 REFIT_PIXELS, MOST_PIXELS = 1 << 18, 1 << 22  # most pixels of an image of a refit, and of one that tells what is seen
@@ -135,11 +135,6 @@ def fitted(pruned: PrunedScene, full: Scene, cameras: Sequence[Camera], rule: Pr
     small, settings = resized(pruned.scene.gaussians, 1 / size), full.settings(head=False)
     small = refit(small, unit.gaussians, scaled, settings, seed=rule.seed, **options)
     return pruned._replace(scene=dataclasses.replace(pruned.scene, gaussians=resized(small, size)))
-
-
-def at_most(camera: Camera, pixels: int) -> Camera:
-    """The camera, zoomed out if its image has more pixels."""
-    return camera.zoomed(min(1.0, math.sqrt(pixels / (camera.width * camera.height))))
 
 
 def weights_in(

@@ -142,6 +142,11 @@ def middle_and_reach(gaussians: Gaussians) -> tuple[Tensor, float]:
     return middle.cpu(), max(reach, 1e-30)
 
 
+def at_most(camera: Camera, pixels: int) -> Camera:
+    """The camera, zoomed out if its image has more pixels."""
+    return camera.zoomed(min(1.0, math.sqrt(pixels / (camera.width * camera.height))))
+
+
 def split(cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:
     """The cameras that decide, and those that are held out: every eighth, from the first on."""
     return [camera for i, camera in enumerate(cameras) if i % 8], list(cameras[::8])
