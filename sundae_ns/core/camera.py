@@ -77,7 +77,8 @@ class Camera(NamedTuple):
             raise ConfigError(f"the focal lengths are {fx:g} and {fy:g}; give positive numbers of pixels")
         checked = numbers(pose, "pose", (3, 4), (4, 4))
         given, axes = pose if isinstance(pose, Tensor) else checked, checked[:3, :3]
-        if float((axes.T @ axes - torch.eye(3, dtype=axes.dtype, device="cpu")).abs().max()) > 0.25 or axes.det() < 0:
+        far = (axes.T @ axes - torch.eye(3, dtype=axes.dtype, device="cpu")).abs().max() > 0.25
+        if far or axes.det() < 0 or (checked[3:, :3].abs() > 1e-6).any():
             raise ConfigError("the first three columns of the pose are not a rotation; give right-handed unit axes")
         K = given.new_tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float32)
         return cls(world_to_camera(given[:3].float()), K, whole(width, "width"), whole(height, "height"), (fx + fy) / 2)

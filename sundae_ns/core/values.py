@@ -58,8 +58,7 @@ def floats(values: Any, name: str, *, colors: bool = False) -> Tensor:
 
 def positions(values: Any, name: str) -> Tensor:
     """As :func:`floats`; ``DataError`` too if float32 moves positions by 1e-4 of their extent, as those of surveys."""
-    tensor = floats(values, name)
-    if tensor is values or not tensor.numel():
+    if (tensor := floats(values, name)) is values or not tensor.numel():
         return tensor
     exact = values.double() if isinstance(values, Tensor) else torch.from_numpy(np.asarray(values).astype(np.float64))
     if (exact - tensor).abs().max() > 1e-4 * (tensor.amax(dim=0) - tensor.amin(dim=0)).max():

@@ -63,8 +63,7 @@ class Placed(NamedTuple):
 
 def placed_in(capture: Path) -> Placed:
     """The photos of a capture; ``DataError`` if its ``transforms.json`` is missing or damaged."""
-    path = capture / TRANSFORMS
-    meta = read_json(path)
+    meta = read_json(path := capture / TRANSFORMS)
     frames, left_out = meta.get("frames"), meta.get("left_out", [])
     if not isinstance(frames, list) or not isinstance(left_out, list):
         raise DataError(f"{path} lists no frames; remove it to make it again")

@@ -202,6 +202,12 @@ def test_axes_that_are_no_rotation_are_refused(capture, load, edit, place, value
         load(capture)
 
 
+def test_transposed_poses_are_refused(capture, load, edit):
+    change_poses(capture, edit, lambda _, pose: pose.T)
+    with pytest.raises(DataError, match="the last row of transform_matrix is not 0 0 0 1; exchange"):
+        load(capture)
+
+
 def test_a_panorama_with_one_step_aside_keeps_its_scale(capture, load, edit, capsys):
     """All cameras but one stand within centimetres; the points are as far as that one, so it is no stray."""
     centres = 0.01 * np.random.default_rng(0).standard_normal((12, 3))

@@ -137,6 +137,7 @@ REFUSED = {
     "fov": (lambda: look_at((0, 0, 1), (0, 0, 0), fov=180), "fov is 180"),
     "scaled pose": (lambda: sn.Camera.from_pose(2 * EYE, (1, 1, 1, 1), 2, 2), "not a rotation"),
     "mirrored pose": (lambda: sn.Camera.from_pose(EYE * [-1, 1, 1, 1], (1, 1, 1, 1), 2, 2), "not a rotation"),
+    "transposed pose": (lambda: sn.Camera.from_pose(CAMERA.viewmat.T, (1, 1, 1, 1), 2, 2), "not a rotation"),
     "focal": (lambda: sn.Camera.from_pose(EYE, (0, 1, 1, 1), 2, 2), "focal lengths are 0 and 1"),
     "a matrix": (lambda: sn.render(SCENE, EYE), "is no camera"),
     "NaN matrix": (lambda: sn.render(SCENE, CAMERA._replace(K=CAMERA.K * np.nan)), "no pinhole"),
