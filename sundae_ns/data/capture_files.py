@@ -114,8 +114,7 @@ def write_smaller(images: Path, advance: Callable[[int], None] = lambda _: None,
     for path in paths:
         image = decoded(path)
         for factor in factors:
-            folder = images.with_name(f"{images.name}_{factor}")
-            folder.mkdir(exist_ok=True)
+            (folder := images.with_name(f"{images.name}_{factor}")).mkdir(exist_ok=True)
             size = max(1, image.width // factor), max(1, image.height // factor)
             image.resize(size, _NEAREST if masks else Image.Resampling.BOX).save(folder / path.name, **JPEG)
         advance(1)

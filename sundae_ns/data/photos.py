@@ -18,6 +18,7 @@ from sundae_ns.core.errors import DataError, reading, regular
 from sundae_ns.data import images
 from sundae_ns.data.images import HEIF, TURNED, check_image, opened, orientation_in, reads_heif
 from sundae_ns.data.layouts import LONGEST_SIDE
+from sundae_ns.data.lenses import kind_of_model
 
 RAW = ".cr2"  # of Canon, which Pillow does not read
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", *HEIF, RAW)
@@ -145,6 +146,7 @@ def photo_of(path: Path) -> Photo:
         with opened(path) as image:
             kind, alpha, exif = str(image.format), image.has_transparency_data, image.getexif()
             orientation, lens, srgb = orientation_in(image), _lens(exif), images.is_srgb(image)
+            kind_of_model("EQUIRECTANGULAR" if "equirectangular" in str(image.info.get("xmp")) else "OPENCV", str(path))
     if kind not in (*_COPIED, *_CONVERTED):
         raise DataError(f"{path} is a {kind} file by its contents; save it as JPEG or PNG, or remove it")
     check_shape(path, size)
@@ -181,8 +183,7 @@ def masks_of(photos: Sequence[Photo], folder: Path) -> list[Path]:
             raise DataError(f"{path} and another photo have one mask, {mask}; put masks into folders as the photos are")
         size, orientation = check_image(mask, mask=True), images.exif_orientation(path)
         # A mask of the upright size is upright; where both sizes are the same, nothing says so.
-        known = orientation in TURNED and size == wanted and size != size[::-1]
-        if orientation != 1 and not known:
+        if orientation != 1 and not (orientation in TURNED and size == wanted != size[::-1]):
             raise DataError(f"{path} is turned by its EXIF entry, and its mask is not; save both upright")
         if size != wanted:
             raise DataError(f"{mask} has {size[0]} x {size[1]} px and its photo {wanted[0]} x {wanted[1]}; scale it")

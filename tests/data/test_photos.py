@@ -66,6 +66,7 @@ def test_copies_are_named(photos):
     assert line.startswith(f"{photos}/0.png is a copy of {photos}/0 again.png; remove one")
 
 
+SPHERE = b'<rdf:Description GPano:ProjectionType="equirectangular"/>'
 ODD = {
     "a pipe": (os.mkfifo, "it is a pipe or a device"),
     "a raw pipe": (lambda path: os.mkfifo(path.with_suffix(".cr2")), "it is a pipe or a device"),
@@ -78,6 +79,10 @@ ODD = {
     "another format": (lambda path: photo(path, "ppm"), "is a PPM file by its contents"),
     "floats": (lambda path: photo(path, "tiff", "F"), "pixels of type F"),
     "a bomb of text": (zipped_text, "Decompressed data too large"),
+    "a panorama": (
+        lambda path: Image.new("RGB", (32, 16)).save(path, "WEBP", xmp=SPHERE),
+        "the images are panoramas: cut",
+    ),
     "a line": (lambda path: photo(path, size=(8000, 2)), "8000 x 2 px, too narrow for camera poses"),
     "a column": (lambda path: photo(path, size=(20, 8000)), "20 x 8000 px, too narrow for camera poses"),
 }
