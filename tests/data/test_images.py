@@ -2,6 +2,7 @@
 
 import struct
 import zlib
+from functools import partial
 
 import numpy as np
 import pytest
@@ -159,22 +160,18 @@ def grey12(path):
     path.write_bytes(struct.pack("<2sHIH", b"II", 42, 8, len(tags)) + table.ljust(100, b"\0") + pixels)
 
 
-def in_planes(path):
-    tifffile.imwrite(path, SAME.transpose(2, 0, 1).astype(np.uint16) * 257, photometric="rgb", planarconfig="separate")
-
-
 def with_profile(mode, space):
     icc = space if isinstance(space, bytes) else profile(space)
     return lambda path: patches().convert(mode).save(path, icc_profile=icc)
 
 
 GREY = np.asarray(patches().convert("L").convert("RGB"), int)
-GREY16 = GREY[..., 0].astype(np.uint16)
+PLANES, RED = 257 * SAME.transpose(2, 0, 1).astype(np.uint16), SAME[..., :1].repeat(3, axis=-1)
 TYPES = {
     "16 bits": (grey16, "L", GREY),
     "12 bits": (grey12, "L", GREY),
-    "16 bits in planes": (in_planes, "RGB", SAME),
-    "white is 0": (lambda path: tifffile.imwrite(path, 65535 - 257 * GREY16, photometric="miniswhite"), "L", GREY),
+    "16 bits in planes": (partial(tifffile.imwrite, data=PLANES, planarconfig="separate"), "RGB", SAME),
+    "white is 0": (partial(tifffile.imwrite, data=65535 - PLANES[0], photometric="miniswhite"), "L", RED),
     "a palette": (lambda path: patches().quantize(64).save(path), "RGB", SAME),
     "grey and alpha": (lambda path: patches().convert("LA").save(path), "RGBA", GREY),
     "CMYK": (lambda path: patches().convert("CMYK").save(path, format="TIFF"), "RGB", SAME),

@@ -143,16 +143,13 @@ REFUSED = {
     "NaN matrix": (lambda: sn.render(SCENE, CAMERA._replace(K=CAMERA.K * np.nan)), "no pinhole"),
     "matrices": (lambda: sn.render(SCENE, CAMERA._replace(viewmat=CAMERA.viewmat[None])), "no float32 tensors"),
     "array": (lambda: sn.render(SCENE, CAMERA._replace(K=np.eye(3))), "no float32 tensors"),
-    **{
-        f"a camera of {name}": (lambda values=values: sn.render(SCENE, CAMERA._replace(**values)), "no pinhole")
-        for name, values in {
-            "skew": {"K": CAMERA.K + torch.eye(3).roll(1, 1) * 5},
-            "zeros": {"viewmat": torch.zeros(4, 4)},
-            "a mirror": {"viewmat": CAMERA.viewmat * torch.tensor([[-1.0], [1], [1], [1]])},
-            "two": {"K": 2 * CAMERA.K},
-            "infinity": {"viewmat": CAMERA.viewmat + torch.eye(4).roll(3, 1) * torch.inf},
-        }.items()
-    },
+    "skew": (lambda: sn.render(SCENE, CAMERA._replace(K=CAMERA.K + torch.eye(3).roll(1, 1))), "no pinhole"),
+    "scaled K": (lambda: sn.render(SCENE, CAMERA._replace(K=2 * CAMERA.K)), "no pinhole"),
+    "zeros": (lambda: sn.render(SCENE, CAMERA._replace(viewmat=torch.zeros(4, 4))), "no pinhole"),
+    "mirrored": (
+        lambda: sn.render(SCENE, CAMERA._replace(viewmat=torch.diag(torch.tensor([-1.0, 1, 1, 1])))),
+        "no pinhole",
+    ),
     "path": (lambda: sn.prune(SCENE, keep=0.5, cameras="a.json"), "'a.json' is no camera"),
     "share": (lambda: sn.prune(SCENE, keep="0.1"), "keep is not made of 1 finite number"),
     "neither": (lambda: sn.prune(SCENE), "either keep .* or count"),
