@@ -91,8 +91,8 @@ def decoded(path: Path) -> Image.Image:
 def decoded_mask(path: Path) -> Image.Image:
     """A mask of type L whose pixels are 0 or 255, by half of the largest, as JPEG has no clear black."""
     with reading(path, "a mask that can be decoded", remedy=REPAIR, missing=REPAIR), opened(path) as image:
-        grey = image.convert("L")
-    return grey.point([255 * (2 * level > int(np.asarray(grey).max())) for level in range(256)])
+        grey = np.asarray(image.convert("L"))
+    return Image.fromarray((grey > grey.max() / 2) * np.uint8(255))
 
 
 def to_srgb(image: Image.Image) -> Image.Image:
