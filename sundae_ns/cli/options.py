@@ -120,8 +120,7 @@ def words_of(options: Any, *names: str) -> list[str]:
     """Words of a command that give the named fields of a dataclass, those that differ from their defaults."""
     words: list[str] = []
     for field in fields(options):
-        value = getattr(options, field.name)
-        if field.name in names and value != field.default:
+        if field.name in names and (value := getattr(options, field.name)) != field.default:
             values = value if isinstance(value, tuple) else (value,)
             given = (word(each) if isinstance(each, Path) else str(each) for each in values)
             words += [f"--{field.name.replace('_', '-')}", *given]

@@ -102,5 +102,4 @@ def run_logged(
 
 def percent_of(line: str) -> float | None:
     """Progress in per cent from a line of ns-train's output; None if the line has none."""
-    match = re.match(r"^\s*\d+ \(([\d.]+)%\)", line)
-    return float(match[1]) if match else None
+    return float(match[1]) if (match := re.match(r"^\s*\d+ \(([\d.]+)%\)", line)) else None

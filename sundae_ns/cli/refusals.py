@@ -59,8 +59,7 @@ def _contains(outer: Path, inner: Path) -> bool:
 
 def check_suffix(out: Path, suffixes: Iterable[str]) -> str:
     """The suffix of an output in lower case; ``ConfigError`` for another one."""
-    suffix = out.suffix.lower()
-    if suffix not in suffixes:
+    if (suffix := out.suffix.lower()) not in suffixes:
         raise ConfigError(f"{out} has no supported suffix; name it {', '.join(suffixes)}")
     return suffix
 
@@ -74,6 +73,5 @@ def check_least(**values: tuple[float | None, float]) -> None:
 
 def check_exclusive(**values: object) -> None:
     """Raise ``ConfigError`` if more than one of the options is given."""
-    given = [f"--{name.replace('_', '-')}" for name, value in values.items() if value is not None]
-    if len(given) > 1:
+    if len(given := [f"--{name.replace('_', '-')}" for name, value in values.items() if value is not None]) > 1:
         raise ConfigError(f"{given[0]} and {given[1]} exclude each other; give one")

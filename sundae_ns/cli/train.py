@@ -140,8 +140,7 @@ def pack_run(run: Path, out: Path, *more: str, finetune: bool) -> int:
     """Pack a finished run, without the fine-tune if it fails, as where the GPU's memory is full; the exit code."""
     words = ["sundae", "pack", word(run), "-o", word(out), *more]
     if finetune:
-        code = run_command([*words, "--finetune", str(FINETUNE_STEPS)])
-        if not code or code in STOPPED:
+        if not (code := run_command([*words, "--finetune", str(FINETUNE_STEPS)])) or code in STOPPED:
             return code
         print(f"# the fine-tune ended with {code}; packing without it:")
     return run_command(words)

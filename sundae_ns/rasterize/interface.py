@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
 from typing import Literal, cast
@@ -57,7 +58,9 @@ def rasterize_cameras(inputs: Inputs, viewmats: Tensor, Ks: Tensor, *, backend: 
     _check(singles[0])
     if isinstance(backend, GsplatBackend) and len(inputs.means):
         return backend.rasterize_cameras(inputs, viewmats, Ks)
-    return torch.stack([backend.rasterize(single).colors for single in singles])
+    with ThreadPoolExecutor(2) as pool:  # much of a small image takes but one core of a CPU
+        mapped = map if torch.is_grad_enabled() or not inputs.means.is_cpu else pool.map
+        return torch.stack([image.colors for image in mapped(backend.rasterize, singles)])
 
 
 def spherical_harmonics(degree: int, directions: Tensor, coeffs: Tensor, *, backend: Backend) -> Tensor:
@@ -112,8 +115,7 @@ def blending_weights(inputs: Inputs, pixels: Tensor | None = None, *, backend: B
     with torch.enable_grad():
         ones = torch.ones_like(fixed["means"][:, :1], requires_grad=True)
         image = rasterize(replace(inputs, **fixed, colors=ones, camera=camera), backend=backend).colors
-        (weights,) = torch.autograd.grad(image.sum() if pixels is None else (image[..., 0] * pixels).sum(), ones)
-    return weights[:, 0]
+        return torch.autograd.grad(image.sum() if pixels is None else (image[..., 0] * pixels).sum(), ones)[0][:, 0]
 
 
 def _check(inputs: Inputs) -> None:

@@ -149,8 +149,6 @@ def _blend(
                 visible = alphas >= MIN_ALPHA
                 blends = logical_and(visible, behind > MIN_TRANSMITTANCE)
                 store(through, p, select(blends, behind, select(visible, 0.0 - absolute(before), before)))
-                if not any_lane(blends):
-                    continue
                 weights = select(blends, alphas * before, 0.0)
                 store(blended_last, p, select(blends, place, load(blended_last, p)))
                 store(summed, p, load(summed, p) + weights)
