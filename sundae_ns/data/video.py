@@ -16,7 +16,7 @@ from sundae_ns.core.errors import DataError, reading, regular, writing
 from sundae_ns.data.images import HIGH_RANGE, JPEG, to_srgb_values
 from sundae_ns.data.photos import LEAST_PHOTOS, check_shape
 
-SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".3gp")
+SUFFIXES = tuple(".mp4 .mov .m4v .avi .mkv .webm .mpg .mpeg .mts .m2ts .ts .3gp .wmv .flv .ogv".split())
 _OPTIONS = {
     # Formats that open no other file: a playlist would take frames of other videos of this machine.
     "format_whitelist": "mov,matroska,avi,mpeg,mpegvideo,mpegts,h264,hevc,flv,asf,ogg",

@@ -47,7 +47,7 @@ def test_photos_of_all_folders_in_the_order_of_their_paths(photos):
 
 @pytest.mark.parametrize("kind", ["jpeg", "mpo", "png", "tiff", "webp", "bmp"])
 def test_the_suffix_is_that_of_the_contents(tmp_path, kind):
-    for index, name in enumerate(("JPG", "jpeg", "png", "tif", "TIFF", "webp", "bmp")):
+    for index, name in enumerate(("JPG", "jpeg", "jfif", "png", "tif", "TIFF", "webp", "bmp")):
         photo(tmp_path / f"{index}.{name}", kind)
     expected = (".png" if kind == "png" else ".jpg", kind in ("jpeg", "mpo", "png"))
     assert {(photo.suffix, photo.as_it_is) for photo in find_photos(tmp_path)} == {expected}

@@ -146,7 +146,7 @@ def test_the_sharpest_frame_of_each_stretch(tmp_path):
     assert left[:13] == [1 + 3 * number for number in range(13)]
 
 
-@pytest.mark.parametrize("name", ["a.mkv", "a.mts", "\udcff.mp4"])
+@pytest.mark.parametrize("name", ["a.mkv", "a.mts", "a.ts", "a.flv", "\udcff.mp4"])
 def test_frames_are_counted_where_no_length_is_stated(tmp_path, name):
     write_colours(tmp_path / name, 5 * [patches()], 1)
     assert _length(tmp_path / name) == 5
