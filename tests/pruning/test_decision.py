@@ -85,8 +85,8 @@ def rule(request):
 
 
 HARD = {
-    "at one spot": lambda: torch.full((1100, 3), 0.1),
-    "a thousand at one spot": lambda: torch.cat([torch.zeros(1000, 3), cloud(200)]),
+    "at one spot": lambda: torch.full((3000, 3), 0.1),
+    "thousands at one spot": lambda: torch.cat([torch.zeros(3000, 3), cloud(500)]),
     "collinear": lambda: cloud(600) * torch.tensor([1.0, 0.0, 0.0]),
     "coplanar": lambda: cloud(600) * torch.tensor([1.0, 1.0, 0.0]),
     "two clusters 1e6 apart": lambda: torch.cat([cloud(300), cloud(300) + 1e6]),
