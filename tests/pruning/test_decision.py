@@ -144,7 +144,7 @@ def test_the_scene_shifted_by_1e5_keeps_its_selection_in_float32(rule):
         torch.testing.assert_close(moved.values["means"] - 1e5, still.values["means"], rtol=0, atol=2**-7)
 
 
-@pytest.mark.parametrize("scale", [2.0**-80, 2.0**-20, 1e-6, 1e6, 2.0**60])
+@pytest.mark.parametrize("scale", [2.0**-80, 1e-6, 2.0**60])
 def test_scale_is_followed(rule, scale):
     # Scales are stored as logarithms, and adding a logarithm rounds: float64 keeps the selection.
     params = {name: value.double() for name, value in gaussians(means=cloud(600)).items()}
