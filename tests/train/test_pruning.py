@@ -227,7 +227,7 @@ def test_trials_decide_how_many_stay_and_the_prune_waits_for_them():
         decided = {**UNPRUNED, COUNT: chosen}
         assert config.due(decided, 3, 60)
         assert config.target(60, decided) == kept
-    assert config.target(5, {**UNPRUNED, COUNT: 7}) == 5
+    assert (config.target(5, {**UNPRUNED, COUNT: 7}), config.target(60, UNPRUNED)) == (5, 6)
     shares = [usual_share(views) for views in (1, 7, 12, 13, 24, 31, 32, 99)]
     assert shares == pytest.approx([0.05, 0.05, 0.05, 0.13 / 2.4, 0.1, 0.31 / 2.4, 0.1, 0.1])
 
