@@ -147,10 +147,6 @@ def test_adobe_rgb_by_exif(tmp_path, stated):
     assert off(decoded(tmp_path / "again.jpg"), expected) <= 3
 
 
-def grey16(path):
-    Image.fromarray(np.asarray(patches().convert("L"), np.uint16) * 257).save(path)
-
-
 def grey12(path):
     """A TIFF, which Pillow does not write."""
     bits = np.round(GREY[..., :1] / 255 * 4095).astype(int) >> np.arange(11, -1, -1) & 1
@@ -168,7 +164,7 @@ def with_profile(mode, space):
 GREY = np.asarray(patches().convert("L").convert("RGB"), int)
 PLANES, RED = 257 * SAME.transpose(2, 0, 1).astype(np.uint16), SAME[..., :1].repeat(3, axis=-1)
 TYPES = {
-    "16 bits": (grey16, "L", GREY),
+    "16 bits": (lambda path: Image.fromarray(257 * GREY[..., 0].astype(np.uint16)).save(path), "L", GREY),
     "12 bits": (grey12, "L", GREY),
     "16 bits in planes": (partial(tifffile.imwrite, data=PLANES, planarconfig="separate"), "RGB", SAME),
     "white is 0": (partial(tifffile.imwrite, data=65535 - PLANES[0], photometric="miniswhite"), "L", RED),

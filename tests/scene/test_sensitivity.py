@@ -71,16 +71,13 @@ def test_predicted_changes_are_those_of_images(scene):
     assert all(torch.equal(found.head[name], again.head[name]) for name in found.head)
 
 
-def test_cameras_of_one_side_tell_fewer_harmonics_apart(scene):
+def test_cameras_of_one_side_tell_fewer_harmonics_apart_and_those_that_see_none_give_a_form(scene):
     forms = [sensitivity_of(scene, cameras(24, turn=turn)).rows["features_rest"] for turn in (6.28, 0.1)]
     assert all(form.shape == (24, 24) for form in forms)
     values = [torch.linalg.eigvalsh(form) for form in forms]
     assert all(float(part[0]) > 0 for part in values)
     around, aside = ((part / part.sum()).clamp_min(1e-12).log().mean() for part in values)
     assert around > aside + 1
-
-
-def test_primitives_that_no_camera_sees(scene):
     form = sensitivity_of(scene, cameras(2, turn=0.1, ahead=1000.0)).rows["features_rest"]
     assert torch.isfinite(form).all()
     assert float(torch.linalg.eigvalsh(form)[0]) > 0

@@ -12,12 +12,6 @@ FIELD = {"means": (3,), "scales": (3,), "quats": (4,), "features_dc": (3,), "opa
 N = 40
 
 
-def gaussians(n=N):
-    params = {name: Parameter(torch.randn(n, *shape)) for name, shape in FIELD.items()}
-    params["opacities"].data.fill_(1.0)
-    return params, {name: Adam([value], lr=0.01) for name, value in params.items()}
-
-
 @pytest.mark.parametrize(
     ("gradients", "radii", "small", "capacity", "grown", "wide"),
     [
@@ -41,7 +35,9 @@ def test_the_highest_gradients_grow(gradients, radii, small, capacity, grown, wi
 @pytest.mark.parametrize(("cap", "expected"), [(None, 2 * N), (N + 7, N + 7), (N, N), (N - 5, N)])
 def test_densification_stops_at_the_cap(cap, expected, wide):
     """Also where small ones are wide on the screen, which gsplat duplicates and splits at once."""
-    params, optimizers = gaussians()
+    params = {name: Parameter(torch.randn(N, *shape)) for name, shape in FIELD.items()}
+    optimizers = {name: Adam([value], lr=0.01) for name, value in params.items()}
+    params["opacities"].data.fill_(1.0)
     params["scales"].data[: N // 2] = -9.0
     strategy = CappedStrategy(cap=cap, grow_grad2d=0.1, prune_opa=1e-9, refine_start_iter=0, refine_every=1)
     strategy.refine_scale2d_stop_iter, strategy.grow_scale2d = (100, 0.05) if wide else (0, 1.0)
