@@ -50,7 +50,7 @@ def prune(
     """Prune a scene of any program, without its photos; by default to a tenth of its Gaussians.
 
     Kept are the Gaussians that virtual cameras see most of; the others are merged into them, and some steps fit pairs
-    to the scene's own images. On a CPU a million Gaussians with three bands of harmonics take about 1.7 GB.
+    to the scene's own images. On a CPU half a million Gaussians with three bands of harmonics take about 2.2 GB.
 
     Args:
         out: file to write, in the format of its suffix: .ply, .spz, .sog, .glb, .sundae, or .html, a web page. A .ply
