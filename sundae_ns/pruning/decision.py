@@ -131,8 +131,7 @@ class Pruner:
     def drop_nonfinite(self) -> int:
         """Remove Gaussians that are not finite, clamp others (``sanitise``); returns how many went.
 
-        Call it before the contribution, which renders the field: one NaN spreads over the image. ``DataError`` if all
-        would go.
+        Call it before a pass over images, in which one NaN spreads. ``DataError`` if all would go.
         """
         sanitised = sanitise(self.params)
         if not sanitised.gaussians.num_gaussians:
@@ -161,10 +160,7 @@ class Pruner:
         return decision
 
     def add(self, count: int, least_opacity: float) -> None:
-        """Add ``count`` Gaussians on top of others, which share their opacity, so that no image changes.
-
-        Per-primitive statistics are dropped: call it once densification has ended.
-        """
+        """Add ``count`` Gaussians on top of others, which share their opacity; statistics of densification go."""
         n = num_gaussians(self.params)
         grow(self.params, self.optimizers, count, least_opacity)
         for state in self.states:

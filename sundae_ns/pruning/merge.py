@@ -174,9 +174,8 @@ def voronoi_labels(graph: NeighborGraph, mask: Tensor) -> Tensor:
     The length of an edge is ``-log W_ij``. All edges are relaxed at once, hop by hop (Bellman and Ford). Among equally
     near kept Gaussians the one found in fewer hops wins, then the one over the earlier neighbour.
 
-    Edges are followed from a Gaussian to its neighbours. Gaussians that reach no kept one so follow edges in both
-    directions: a thousand clones share the same few neighbours, and all of these may be dropped. Gaussians that are
-    connected to no kept one have the label -1.
+    Gaussians that reach no kept one so follow edges in both directions: a thousand clones share the same few
+    neighbours, and all of these may be dropped. Gaussians that are connected to no kept one have the label -1.
     """
     device = graph.weights.device
     mask = mask.to(device)

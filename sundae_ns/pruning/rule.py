@@ -98,10 +98,7 @@ def band_rule(rule: PruneRule, gamma: float) -> PruneRule:
 
 
 def kept_count(share: float, n: int) -> int:
-    """``round(share * n)`` of ``n`` Gaussians, at least 1: the one place that turns a share into a count.
-
-    ``ConfigError`` for a share that is not in (0, 1].
-    """
+    """``round(share * n)`` of ``n`` Gaussians, at least 1; ``ConfigError`` for a share that is not in (0, 1]."""
     if not 0 < share <= 1:
         raise ConfigError(f"keep_ratio is {share}: use a share in (0, 1], 0.1 to keep a tenth")
     return max(1, round(share * n))

@@ -54,8 +54,7 @@ def response(params: Mapping[str, Tensor], rule: PruneRule, graph: NeighborGraph
 def attribute_signal(params: Mapping[str, Tensor]) -> Tensor:
     """Position, colour, opacity and log size, each without a unit and of similar spread ``[N, 10]``.
 
-    Each group is divided by its own spread, so that no group dominates the response. The channels of a group share one
-    spread: in a flat field, the flat axis must not be scaled up to the others.
+    Each group is divided by its own spread, which its channels share: flat axes must not be scaled up to the others.
     """
     params = as_gaussians(params).as_harmonics()
     colors, opacities = sh_to_rgb(params["features_dc"]), params["opacities"].sigmoid().reshape(-1, 1)

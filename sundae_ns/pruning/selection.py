@@ -4,9 +4,6 @@ Both functions take scores ``[N]`` of any floating dtype on any device, and retu
 with exactly ``count`` True entries. Among equal scores the lower index is selected first. NaN means "unknown" and is
 selected last; ``+inf`` is the highest score. All work is done on the CPU in float64, so the same scores give the same
 mask on every device.
-
-Independent draws leave holes and clumps by chance. Systematic sampling draws one Gaussian in each stretch of an order
-in which neighbours follow each other. It covers a field evenly, and keeps the probability of each Gaussian.
 """
 
 from __future__ import annotations
@@ -49,9 +46,9 @@ def inclusion_probabilities(score: Tensor, count: int) -> Tensor:
 
 
 def neighbor_order(points: Tensor) -> Tensor:
-    """An order in which neighbours follow each other: the leaves of a balanced tree, int64 on the CPU ``[N]``.
+    """An order in which finite points ``[N, 3]`` follow neighbours, by a balanced tree, int64 on the CPU ``[N]``.
 
-    Unlike a Morton code it resolves a cluster of any size. Points ``[N, 3]`` are finite, N is at least 1.
+    Unlike a Morton code it resolves a cluster of any size.
     """
     return build_tree(points.detach()).order.cpu().long()
 

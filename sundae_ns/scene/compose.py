@@ -210,7 +210,7 @@ def floater_mask(
         raise ConfigError(f"the strength of remove-floaters is {strength}; give 0 (careful) to 1 (thorough)")
     if not (sanitised := sanitise(scene.gaussians)).gaussians.num_gaussians:
         raise DataError("no Gaussian is finite; export the scene again")
-    floats = floater_odds(sanitised.gaussians) > 6.5 - 5 * strength  # logarithms
+    floats = floater_odds(sanitised.gaussians) > 2 - 8 * strength**0.5  # logarithms
     if cameras:
         usable = dataclasses.replace(scene, gaussians=sanitised.gaussians)
         floats |= weights_in(usable, for_cleaning(cameras), console=console) <= 0

@@ -8,6 +8,7 @@ import torch
 
 import sundae_ns as sn
 from sundae_ns.core.errors import ConfigError, DataError
+from sundae_ns.pruning.floaters import floater_odds
 from sundae_ns.scene.compose import crop_mask, floater_mask
 
 VIEWS = tuple(sn.Camera.look_at((x, -4.0, 1.0), (0.0, 0.0, 0.0), fov=60, width=96, height=72) for x in (-2.0, 0.0, 2.0))
@@ -37,17 +38,13 @@ def planted(n=30):
 @pytest.mark.parametrize("with_views", [True, False])
 def test_planted_floaters_vanish_and_the_surface_stays(factor, with_views):
     floaters, surface = planted(), wall()
-    whole = scene_of(torch.cat([surface, floaters]), 0.02)
-    whole.gaussians["means"] *= factor
-    whole.gaussians["scales"] += math.log(factor)
-    cameras = [camera._replace(viewmat=camera.viewmat.clone()) for camera in VIEWS]
-    for camera in cameras:
-        camera.viewmat[:3, 3] *= factor
-    found = floater_mask(whole, cameras if with_views else (), 0.9)
+    whole = sn.transform(scene_of(torch.cat([surface, floaters]), 0.02), scale=factor)
+    found = floater_mask(whole, whole.cameras if with_views else (), 0.9)
     assert bool(found[len(surface) :].all())
     assert int(found[: len(surface)].sum()) <= 2
+    assert 0 < int(floater_mask(whole, (), 0.0).sum()) < len(floaters), "a lower strength removes less"
     if factor == 1:
-        clean = sn.remove_floaters(whole, 0.9, cameras=cameras if with_views else ())
+        clean = sn.remove_floaters(whole, 0.9, cameras=VIEWS if with_views else ())
         assert clean.num_gaussians == int((~found).sum())
         truth = scene_of(surface, 0.02)
         assert sn.measure(clean, truth).psnr > 50
@@ -84,8 +81,7 @@ def test_floaters_are_counted_after_values_without_meaning():
 @pytest.mark.parametrize("n", [1, 2, 5])
 def test_few_primitives(n):
     points = torch.arange(3.0 * n).view(n, 3)
-    assert int(floater_mask(scene_of(points, 9.0), (), 0.5).sum()) == 0
-    assert bool(floater_mask(scene_of(points, 0.01), (), 0.5).any()) == (n > 1)
+    assert not any(bool(floater_mask(scene_of(points, size), (), 1.0).any()) for size in (0.01, 9.0)), "all are alone"
     with pytest.raises(ConfigError, match="strength of remove-floaters is 2"):
         sn.remove_floaters(scene_of(points, 9.0), 2)
 
@@ -97,7 +93,11 @@ def test_needles_and_balls_unlike_their_neighbours_go_and_a_background_stays():
     whole.gaussians["scales"][1] = math.log(0.3)
     whole.gaussians["scales"][2] = math.log(30.0)
     assert floater_mask(whole, (), 0.9).nonzero()[:, 0].tolist() == [0, 1]
-    assert int(floater_mask(whole, (), 0.0).sum()) == 0
+    alone, means = floater_odds(whole.gaussians)[1], whole.means
+    around = (means - means[1]).norm(dim=1).argsort()[1:4]
+    whole.gaussians["features_dc"][around] = 1.5
+    whole.gaussians["scales"][around] = math.log(0.1)
+    assert floater_odds(whole.gaussians)[1] < alone - 3, "others of its colour cover its centre"
 
 
 def test_a_box_is_exact_and_keeps_all_else():
