@@ -24,9 +24,8 @@ from sundae_ns.scene.compose import floater_mask
 from sundae_ns.scene.virtual_cameras import middle_and_reach, usable
 
 PLANTED, HELD_OUT, PHOTOS = 100, 12, 8  # floaters of each kind, cameras, and most photos
-KINDS = ("near", "shell", "haze", "spikes")
+KINDS, STRENGTHS = ("near", "shell", "haze", "spikes"), (0.25, 0.5)
 COLUMNS = ("field", "strength", "kind", "planted", "removed", "others_removed", "psnr_lost", "images_lost")
-STRENGTHS = (0.25, 0.5)
 
 
 def points_in_front(

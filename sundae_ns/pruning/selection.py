@@ -46,10 +46,7 @@ def inclusion_probabilities(score: Tensor, count: int) -> Tensor:
 
 
 def neighbor_order(points: Tensor) -> Tensor:
-    """An order in which finite points ``[N, 3]`` follow neighbours, by a balanced tree, int64 on the CPU ``[N]``.
-
-    Unlike a Morton code it resolves a cluster of any size.
-    """
+    """An order in which neighbours follow each other: leaves of a balanced tree of finite points, int64 ``[N]``."""
     return build_tree(points.detach()).order.cpu().long()
 
 
