@@ -85,6 +85,7 @@ def exit_with(command: Callable[[], int], name: str) -> NoReturn:
     with suppress(AttributeError, OSError, TypeError, ValueError):  # glibc read them before: state them to it again
         for number, variable in ((-3, "MALLOC_MMAP_THRESHOLD_"), (-1, "MALLOC_TRIM_THRESHOLD_")):
             ctypes.CDLL(None).mallopt(number, int(os.environ[variable]))
+        ctypes.CDLL(None).mallopt(-8, int(os.environ.get("MALLOC_ARENA_MAX", "1")))  # those of threads hold no images
     try:
         # Commands name the file that they cannot write; this covers others, such as a full disk behind stdout.
         with writing(f"{name} ended early"):

@@ -72,8 +72,7 @@ def render(
             count = write_video(partial, images, frames_per_second=speed)
         print(f"{out}: {count} frames of {views[0].width} x {views[0].height} px, {count / speed:.1f} s")
         return 0
-    index = view or 0
-    if (view is None and len(views) > 1) or not 0 <= index < len(views):
+    if (view is None and len(views) > 1) or not 0 <= (index := view or 0) < len(views):
         raise ConfigError(f"there are {len(views)} cameras; give --view 0 to {len(views) - 1}, or write an .mp4")
     write_image(out, image_of(render_view(shown, views[index]).rgb))
     print(f"{out}: {views[index].width} x {views[index].height} px")

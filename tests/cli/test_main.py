@@ -61,7 +61,7 @@ def test_memory_of_images_stays_with_the_process(tmp_path, monkeypatch):
     monkeypatch.setattr("ctypes.CDLL", Mock(return_value=library))
     monkeypatch.setenv("MALLOC_TRIM_THRESHOLD_", "7")
     run("export", tmp_path / "missing", tmp_path / "out.ply")
-    assert [call.args for call in library.mallopt.call_args_list] == [(-3, 2**25), (-1, 7)]
+    assert [call.args for call in library.mallopt.call_args_list] == [(-3, 2**25), (-1, 7), (-8, 1)]
 
 
 def test_torch_is_not_loaded_before_a_command_starts():
