@@ -308,6 +308,7 @@ def test_invalid_input_raises_one_line():
         (ConfigError, "set redistribution to none", lambda: decide_share(params, draws(score="response"))),
         (DataError, r"shape \[59\] for 60", lambda: decide_share(params, DEFAULT, 0.1, torch.ones(59))),
         (ConfigError, "gamma", lambda: decide_share(params, draws(gamma=2.0))),
+        (ConfigError, "gamma", lambda: decide(params, draws(score=opacity, gamma=2.0), 6)),
         (DataError, r"score has shape \[3\] for 60", lambda: decide(params, three, 6)),
     ]
     for error, message, call in cases:

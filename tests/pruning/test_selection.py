@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sundae_ns.core.errors import DataError
+from sundae_ns.pruning import selection
 from sundae_ns.pruning.rule import kept_count
 from sundae_ns.pruning.selection import inclusion_probabilities, neighbor_order, select_band, select_systematic
 
@@ -71,6 +72,7 @@ def test_probabilities_are_in_proportion_up_to_1_and_sum_to_the_count():
     assert values[certain].min() > values[~certain].max()
     ratio = probabilities[~certain] / values[~certain]
     torch.testing.assert_close(ratio, ratio[:1].expand_as(ratio))
+    assert selection._systematic_sample(torch.tensor([0.0, 0.5, 0.5]).double(), 1, 0.0).tolist() == [1], "0 is never"
     # No Gaussian is certain without need.
     assert float(probabilities[~certain].max()) < 1
 
