@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import ctypes
 import gc
 import importlib
 import io
@@ -12,7 +11,6 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from difflib import get_close_matches
 from tempfile import gettempdir
 from typing import NoReturn
@@ -82,10 +80,6 @@ def exit_with(command: Callable[[], int], name: str) -> NoReturn:
     """Run a command and exit with its code; 2 after the one line of a :class:`SundaeError`, 130 for an interrupt."""
     for variable, value in ENVIRONMENT.items():
         os.environ.setdefault(variable, value)
-    with suppress(AttributeError, OSError, TypeError, ValueError):  # glibc read them before: state them to it again
-        for number, variable in ((-3, "MALLOC_MMAP_THRESHOLD_"), (-1, "MALLOC_TRIM_THRESHOLD_")):
-            ctypes.CDLL(None).mallopt(number, int(os.environ[variable]))
-        ctypes.CDLL(None).mallopt(-8, int(os.environ.get("MALLOC_ARENA_MAX", "1")))  # those of threads hold no images
     try:
         # Commands name the file that they cannot write; this covers others, such as a full disk behind stdout.
         with writing(f"{name} ended early"):

@@ -56,14 +56,6 @@ def test_threads_of_torch_do_not_spin_unless_the_user_chose(tmp_path, monkeypatc
     assert os.environ["OMP_WAIT_POLICY"] == (chosen or "PASSIVE")
 
 
-def test_memory_of_images_stays_with_the_process(tmp_path, monkeypatch):
-    library = Mock()
-    monkeypatch.setattr("ctypes.CDLL", Mock(return_value=library))
-    monkeypatch.setenv("MALLOC_TRIM_THRESHOLD_", "7")
-    run("export", tmp_path / "missing", tmp_path / "out.ply")
-    assert [call.args for call in library.mallopt.call_args_list] == [(-3, 2**25), (-1, 7), (-8, 1)]
-
-
 def test_torch_is_not_loaded_before_a_command_starts():
     code = "import sys, sundae_ns.cli; sys.exit(bool({'torch', 'numpy', 'nerfstudio'} & sys.modules.keys()))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
