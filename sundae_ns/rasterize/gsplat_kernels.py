@@ -25,7 +25,6 @@ from sundae_ns.cuda.kernels import Argument, load_kernels
 from sundae_ns.rasterize.reference import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 
 TILE = 16  # Side of gsplat's tiles, pixels
-
 LANES = 32  # threads of a warp
 _PIXELS = TILE * TILE  # of a tile, and threads of a block that blends one
 _PER_BLOCK = 128  # Gaussians of a block of threads, which reads and writes their coefficients as one piece

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
-from typing import Literal, cast
+from typing import Any, Literal, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -19,6 +20,7 @@ from sundae_ns.rasterize.reference import ReferenceBackend
 from sundae_ns.rasterize.types import Backend, Inputs, Rasterization, check_memory, constant
 
 BackendName = Literal["auto", "gsplat", "cpu", "reference"]
+T = TypeVar("T")
 
 
 def rasterize(inputs: Inputs, *, backend: Backend) -> Rasterization:
@@ -51,16 +53,19 @@ def rasterize_cameras(inputs: Inputs, viewmats: Tensor, Ks: Tensor, *, backend: 
     _check_shapes((viewmats, "viewmats", (count, 4, 4)), (Ks, "Ks", (count, 3, 3)))
     if colors.dim() != 3 or colors.shape[0] != count:
         raise DataError(f"colors has shape {list(colors.shape)}; pass [{count}, {len(inputs.means)}, C]")
-    singles = [
-        replace(inputs, colors=color, camera=inputs.camera._replace(viewmat=viewmat, K=K))
-        for color, viewmat, K in zip(colors, viewmats, Ks, strict=True)
-    ]
+    views = [inputs.camera._replace(viewmat=viewmat, K=K) for viewmat, K in zip(viewmats, Ks, strict=True)]
+    singles = [replace(inputs, colors=color, camera=camera) for color, camera in zip(colors, views, strict=True)]
     _check(singles[0])
     if isinstance(backend, GsplatBackend) and len(inputs.means):
         return backend.rasterize_cameras(inputs, viewmats, Ks)
-    with ThreadPoolExecutor(2) as pool:  # much of a small image takes but one core of a CPU
-        mapped = map if torch.is_grad_enabled() or not inputs.means.is_cpu else pool.map
-        return torch.stack([image.colors for image in mapped(backend.rasterize, singles)])
+    images = each_view(backend.rasterize, singles, pairs=inputs.means.is_cpu and not torch.is_grad_enabled())
+    return torch.stack([image.colors for image in images])
+
+
+def each_view(function: Callable[[Any], T], views: Iterable[Any], *, pairs: bool) -> Iterator[T]:
+    """Results of a function for each view; with ``pairs`` two at a time: parts of a view take one core of a CPU."""
+    with ThreadPoolExecutor(2) as pool:
+        yield from (pool.map if pairs else map)(function, views)
 
 
 def spherical_harmonics(degree: int, directions: Tensor, coeffs: Tensor, *, backend: Backend) -> Tensor:
@@ -107,10 +112,9 @@ def blending_weights(inputs: Inputs, pixels: Tensor | None = None, *, backend: B
     colour, and no backend needs code for it. ``pixels`` ``[H, W]`` are weights; None stands for 1. All else is as for
     :func:`rasterize`; colours are ignored.
     """
-    camera = inputs.camera
+    camera = inputs.camera._replace(viewmat=inputs.camera.viewmat.detach(), K=inputs.camera.K.detach())
     if pixels is not None:
         _check_shapes((pixels, "pixels", (camera.height, camera.width)))
-    camera = camera._replace(viewmat=camera.viewmat.detach(), K=camera.K.detach())
     fixed = {name: getattr(inputs, name).detach() for name in ("means", "quats", "scales", "opacities")}
     with torch.enable_grad():
         ones = torch.ones_like(fixed["means"][:, :1], requires_grad=True)

@@ -21,16 +21,11 @@ from sundae_ns.core.covariance import rotation_matrices
 from sundae_ns.rasterize.types import Inputs, Rasterization, check_memory, check_pairs, result_of
 
 BLUR = 0.3  # Variance in square pixels added to each footprint
-
 FOV_MARGIN = 0.3
 MAX_RADIUS = 1e9  # keeps radii within int32
-
 BIN = 16  # Side of gsplat's tiles, pixels: a Gaussian is blended in all tiles that its three-sigma square touches
-
 MIN_ALPHA = 1.0 / 255.0  # Contributions fainter than this are skipped
-
 MAX_ALPHA = 0.999  # Upper bound of alpha, so that no single Gaussian makes a pixel opaque
-
 MIN_TRANSMITTANCE = 1e-4
 """A pixel is finished when its next Gaussian would leave no more transmittance than this; that one is not blended."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -15,7 +14,7 @@ from sundae_ns.core.errors import DataError
 from sundae_ns.core.gaussians import FEATURES, MAX_SH_DEGREE, Gaussians
 from sundae_ns.head.head import CompensationHead, ScalePlan, plan, resize
 from sundae_ns.pruning.scores import pixel_detail
-from sundae_ns.rasterize.interface import blending_weights, harmonic_colors, rasterize
+from sundae_ns.rasterize.interface import blending_weights, each_view, harmonic_colors, rasterize
 from sundae_ns.rasterize.reference import BLUR, FOV_MARGIN
 from sundae_ns.rasterize.types import Backend, Inputs, Rasterization, check_memory
 
@@ -234,10 +233,9 @@ def contribution(
         image = None if images is None else torch.cat([splatted.colors.detach(), splatted.alpha.detach()], dim=2).half()
         return rows, torch.autograd.grad(blended, colors)[0][:, 0], image
 
-    with ThreadPoolExecutor(2) as pool:  # parts of a view take but one core of a CPU, so two views share the others
-        views = (pool.map if total.is_cpu else map)(of_view, cameras)
-        for rows, new, image in track(views, label, len(cameras), transient=True, console=console, disable=not console):
-            total[rows] += new
-            if images is not None:
-                images.append(image)
+    views = each_view(of_view, cameras, pairs=total.is_cpu)
+    for rows, new, image in track(views, label, len(cameras), transient=True, console=console, disable=not console):
+        total[rows] += new
+        if images is not None:
+            images.append(image)
     return total

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sundae_ns.io.pack.container import Array, Levels
-from sundae_ns.rasterize.cpu.parallel import compiled, inlined
+from sundae_ns.rasterize.cpu.lanes import load, minimum, store
+from sundae_ns.rasterize.cpu.parallel import borrowing, compiled, inlined, parallel_for
 
 LARGEST = (1 << 24) - 1  # magnitude of a number
 CONTEXTS = 4
@@ -24,6 +25,7 @@ _MASK = 0xFFFFFFFF
 _NODES = 144  # no power of two: contexts would share the sets of a cache
 _LAST = 24
 _CLASSES = 16
+_KINDS = 63 + _CLASSES * _CLASSES
 _EVEN = 1 << 15
 
 Stream = NDArray[np.uint8]
@@ -31,8 +33,9 @@ Near = NDArray[np.int32]  # rows ``[N, NEIGHBOURS]`` before each row, the neares
 
 # Probabilities of 12 bits ``[4095]`` for -2047 to 2047 in 256ths of their logits. The format fixes these numbers: other
 # machines' exponentials must round to them (a test holds their hash).
-_SQUASH = np.rint(4096 / (1 + np.exp(-np.arange(-2047, 2048) / 256))).clip(1, 4095).astype(np.int32)
-_STRETCH = np.searchsorted(_SQUASH, np.arange(4096), side="left").clip(0, 4094).astype(np.int32) - 2047
+_SQUASH = np.rint(4096 / (1 + np.exp(-np.arange(-2047, 2048) / 256))).clip(1, 4095).astype(np.int16)
+_STRETCH = (np.searchsorted(_SQUASH, np.arange(4096), side="left").clip(0, 4094) - 2047).astype(np.int16)
+_CLASS = np.repeat(np.arange(_CLASSES), 1 << (np.arange(_CLASSES) // 2 - 1).clip(0))  # of magnitudes to 255 and up
 _RATES = (65536 * 5 // (5 * np.arange(256) + 8)).astype(np.int32)
 
 
@@ -60,39 +63,37 @@ def _coded(coder, stream, chance, bit):  # type: ignore[no-untyped-def]
     return bit, (low, high, code, place)
 
 
-@compiled
-def _chances(contexts, decisions):  # type: ignore[no-untyped-def]
-    """Chances in all contexts, 16 bits above the count of their decisions, and the weights of the mix."""
-    model = np.full(contexts * _NODES, _EVEN << 7, np.int32)
-    return model, np.full((decisions * _NODES, CONTEXTS), 0x5000, np.int32)
-
-
-@inlined
-def _adapted(model, weights, row, context, place, score, error, bit):  # type: ignore[no-untyped-def]
-    """Adapt the chance in a context, and its weight in the mix."""
-    weight = weights[row, context] + ((score * error + 0x8000) >> 16)
-    weights[row, context] = min(max(weight, -(1 << 19)), 1 << 19)
-    count, chance = model[place] & 127, model[place] >> 7
-    moved = chance + ((((bit * 65535 - chance) >> 3) * _RATES[count]) >> 13)
-    model[place] = min(max(moved, 16), 65519) << 7 | min(count + 1, 127)
+def _chances(contexts: int, decisions: int) -> tuple[Array, ...]:
+    """Chances in all contexts, 16 bits above the count of their decisions, weights of the mix, and room for lanes."""
+    model = np.full(contexts * _NODES, _EVEN << 7, np.uint32)
+    return model, np.full((decisions * _NODES, CONTEXTS), 0x5000, np.int32), np.zeros(12, np.int32)
 
 
 @inlined
 def _decided(coder, stream, chances, kinds, row, node, bit):  # type: ignore[no-untyped-def]
     """Code the decision ``node`` with the mix of its chances in four contexts, and adapt them; the bit, the coder."""
-    model, weights = chances
-    a, b = kinds[0] * _NODES + node, kinds[1] * _NODES + node
-    c, d = kinds[2] * _NODES + node, kinds[3] * _NODES + node
+    model, weights, at_hand = chances
+    # Unsigned: of other numbers numba asks whether they count from the end.
+    a, b = np.uint32(kinds[0] * _NODES + node), np.uint32(kinds[1] * _NODES + node)
+    c, d = np.uint32(kinds[2] * _NODES + node), np.uint32(kinds[3] * _NODES + node)
+    row = np.uint32(row)
     of_a, of_b = _STRETCH[model[a] >> 11], _STRETCH[model[b] >> 11]
     of_c, of_d = _STRETCH[model[c] >> 11], _STRETCH[model[d] >> 11]
     total = of_a * weights[row, 0] + of_b * weights[row, 1] + of_c * weights[row, 2] + of_d * weights[row, 3]
     chance = _SQUASH[min(max(total >> 16, -2047), 2047) + 2047]
+    at_hand[0], at_hand[1], at_hand[2], at_hand[3] = model[a], model[b], model[c], model[d]
+    at_hand[4], at_hand[5], at_hand[6], at_hand[7] = of_a, of_b, of_c, of_d
+    at_hand[8], at_hand[9] = _RATES[model[a] & 127], _RATES[model[b] & 127]
+    at_hand[10], at_hand[11] = _RATES[model[c] & 127], _RATES[model[d] & 127]
     bit, coder = _coded(coder, stream, chance << 4, bit)
-    error = ((bit << 12) - chance) * 10
-    _adapted(model, weights, row, 0, a, of_a, error, bit)
-    _adapted(model, weights, row, 1, b, of_b, error, bit)
-    _adapted(model, weights, row, 2, c, of_c, error, bit)
-    _adapted(model, weights, row, 3, d, of_d, error, bit)
+    # They adapt in lanes; the mix above is scalar, as a decoder waits for it. max(x, y) is y - min(y - x, 0).
+    states, most = load(at_hand, 0), 1 << 19
+    weight = load(weights, row * CONTEXTS) + ((load(at_hand, 4) * (((bit << 12) - chance) * 10) + 0x8000) >> 16)
+    store(weights, row * CONTEXTS, minimum(0 - minimum(0 - weight, most), most))
+    old = states >> 7
+    moved = minimum(old + ((((bit * 65535 - old) >> 3) * load(at_hand, 8)) >> 13), 65519)
+    store(at_hand, 0, (16 - minimum(16 - moved, 0)) * 128 + minimum((states & 127) + 1, 127))
+    model[a], model[b], model[c], model[d] = at_hand[0], at_hand[1], at_hand[2], at_hand[3]
     return bit, coder
 
 
@@ -128,10 +129,7 @@ def _number(coder, stream, chances, kinds, first, value, reading):  # type: igno
 @compiled
 def _magnitude(value):  # type: ignore[no-untyped-def]
     """Class of a magnitude, 0 to 15: two classes for each doubling."""
-    size, digits = abs(value), 0
-    while size >> digits > 3:
-        digits += 1
-    return min(2 * digits + (size >> digits), _CLASSES - 1)
+    return _CLASS[np.uint32(min(abs(value), 255))]
 
 
 @compiled
@@ -141,12 +139,10 @@ def _signed(value):  # type: ignore[no-untyped-def]
     return _CLASSES - 1 + (kind if value > 0 else -kind)
 
 
-@compiled
-def _run(levels, near, stream, coder, reading):  # type: ignore[no-untyped-def]
+@borrowing
+def _run(levels, near, chances, stream, coder, reading):  # type: ignore[no-untyped-def]
     """Code levels ``[N, C]`` row after row; the coder after them."""
     n, width = levels.shape
-    each = 63 + _CLASSES * _CLASSES
-    chances = _chances(width * each, width)
     for i in range(n):
         total = 0
         for k in range(width):
@@ -159,7 +155,7 @@ def _run(levels, near, stream, coder, reading):  # type: ignore[no-untyped-def]
                     amount += abs(value)
                     if q == 0:
                         nearest = value
-            start = k * each
+            start = k * _KINDS
             sizes = _magnitude(amount >> 1) * _CLASSES + _magnitude(total)
             kinds = start, start + 1 + _signed(nearest), start + 32 + _signed(around >> 2), start + 63 + sizes
             value, coder = _number(coder, stream, chances, kinds, k * _NODES, levels[i, k], reading)
@@ -169,10 +165,10 @@ def _run(levels, near, stream, coder, reading):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _search(cells, block, near):  # type: ignore[no-untyped-def]
+def _search(begin, end, cells, block, near):  # type: ignore[no-untyped-def]
     """Fill ``near`` with the nearest earlier rows of the same block, the nearest first."""
     least = np.zeros(NEIGHBOURS, np.int64)
-    for i in range(len(cells)):
+    for i in range(begin, end):
         found = 0
         for j in range(i - 1, max(i - WINDOW, i // block * block) - 1, -1):
             distance = 0
@@ -188,10 +184,9 @@ def _search(cells, block, near):  # type: ignore[no-untyped-def]
             found = min(found + 1, NEIGHBOURS)
 
 
-@compiled
-def _run_gaps(codes, block, bits, stream, coder, reading):  # type: ignore[no-untyped-def]
+@borrowing
+def _run_gaps(codes, block, bits, chances, stream, coder, reading):  # type: ignore[no-untyped-def]
     """Code ascending Morton codes ``[N]``: the number of digits of each difference, and its digits; the coder after."""
-    chances = _chances(1 + 3 * 64, 1)
     last, before, average = 0, 0, 0
     for i in range(len(codes)):
         gap, digits = 0, 0
@@ -226,20 +221,20 @@ def _run_gaps(codes, block, bits, stream, coder, reading):  # type: ignore[no-un
 
 def encode_gaps(codes: NDArray[np.uint64], block: int, bits: int) -> Stream:
     """Code Morton codes of cells, which ascend in each block."""
-    return _written(_run_gaps, len(codes) * 12 + 16, codes.astype(np.int64), block, bits)
+    return _written(_run_gaps, len(codes) * 12 + 16, codes.astype(np.int64), block, bits, _chances(1 + 3 * 64, 1))
 
 
 def decode_gaps(stream: Stream, count: int, block: int, bits: int) -> NDArray[np.uint64]:
     """Morton codes ``[N]`` from :func:`encode_gaps`; ``ValueError`` if the stream does not end with its last number."""
     codes = np.zeros(count, np.int64)
-    _read(_run_gaps, stream, codes, block, bits)
+    _read(_run_gaps, stream, codes, block, bits, _chances(1 + 3 * 64, 1))
     return codes.astype(np.uint64)
 
 
 def neighbours_of(cells: Array, block: int) -> Near:
     """Nearest earlier rows ``[N, NEIGHBOURS]`` in the same block of cells ``[N, 3]`` below 2^21; -1 for none."""
     near = np.full((len(cells), NEIGHBOURS), -1, np.int32)
-    _search(np.ascontiguousarray(cells, np.int64), block, near)
+    parallel_for(_search, len(near), np.ascontiguousarray(cells, np.int64), block, near, min_per_thread=1000)
     return near
 
 
@@ -252,13 +247,13 @@ def predecessors(count: int) -> Near:
 def encode_levels(levels: Array, near: Near) -> Stream:
     """Code numbers ``[N, C]`` of at most :data:`LARGEST`, given the neighbours of each row."""
     values = np.ascontiguousarray(levels, np.int32).copy()
-    return _written(_run, values.size * 5 + 16, values, near)
+    return _written(_run, values.size * 5 + 16, values, near, _chances(_KINDS * levels.shape[1], levels.shape[1]))
 
 
 def decode_levels(stream: Stream, width: int, near: Near) -> Levels:
     """Numbers ``[N, C]`` from :func:`encode_levels`; ``ValueError`` if the stream does not end with its last number."""
     levels = np.zeros((len(near), width), np.int32)
-    _read(_run, stream, levels, near)
+    _read(_run, stream, levels, near, _chances(_KINDS * width, width))
     return levels
 
 

@@ -29,7 +29,6 @@ from sundae_ns.rasterize.cpu.lanes import (
     exp_negative,
     fma,
     load,
-    logical_and,
     minimum,
     select,
     store,
@@ -147,7 +146,7 @@ def _blend(
                 before = load(through, p)
                 behind = before * (1.0 - alphas)
                 visible = alphas >= MIN_ALPHA
-                blends = logical_and(visible, behind > MIN_TRANSMITTANCE)
+                blends = visible & (behind > MIN_TRANSMITTANCE)
                 store(through, p, select(blends, behind, select(visible, 0.0 - absolute(before), before)))
                 weights = select(blends, alphas * before, 0.0)
                 store(blended_last, p, select(blends, place, load(blended_last, p)))
@@ -228,7 +227,7 @@ def _blend_backward(begin: int, end: int, lists: Any, blended: Any, gradients: A
                 dy = load(down, p) - v
                 unclamped = _unclamped_alphas(dx, dy, row)
                 alphas = minimum(unclamped, MAX_ALPHA)
-                blends = logical_and(alphas >= MIN_ALPHA, load(blended_last, p) >= place)
+                blends = (alphas >= MIN_ALPHA) & (load(blended_last, p) >= place)
                 inverse = 1.0 / (1.0 - alphas)
                 before = load(through, p) * inverse
                 weight = select(blends, alphas * before, 0.0)
@@ -240,7 +239,7 @@ def _blend_backward(begin: int, end: int, lists: Any, blended: Any, gradients: A
                     gain = weight * (load(alpha_grads, p) + _product(grads, p * padded, row, channels))
                     later = load(behind, p)
                     store(behind, p, later + gain)
-                    varies = logical_and(blends, unclamped < MAX_ALPHA)
+                    varies = blends & (unclamped < MAX_ALPHA)
                     grad_exponent = select(varies, gain - alphas * inverse * later, 0.0)
                     grad_x, grad_y = grad_exponent * dx, grad_exponent * dy
                     m, mx, my = m + grad_exponent, mx + grad_x, my + grad_y

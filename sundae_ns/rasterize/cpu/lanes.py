@@ -1,4 +1,4 @@
-"""SIMD values for loops compiled by numba: sixteen numbers that a loop holds in one variable.
+"""SIMD values for loops compiled by numba: sixteen numbers that a loop holds in one variable, or four of int32.
 
 LLVM vectorises simple loops only, and no sums, whose order it must not change. Here a variable holds sixteen pixels,
 every sum has a fixed order, and only :func:`fma` leaves a product unrounded, so results do not depend on the width of
@@ -21,16 +21,16 @@ from numba.core.datamodel import models
 from numba.extending import intrinsic, overload, register_model
 from numba.np import arrayobj
 
-WIDTH = 16  # Number of lanes: in float32 one register of AVX-512, or four of SSE or NEON, whose latencies overlap
+WIDTH = 16  # Lanes of floats: in float32 one register of AVX-512, or four of SSE or NEON, whose latencies overlap
 
 _WORD = ir.IntType(32)
 
 
 class Lanes(types.Type):
-    """Numba's type of sixteen numbers, or of a mask of sixteen booleans."""
+    """Numba's type of sixteen numbers, of four of int32, or of a mask of sixteen booleans."""
 
     def __init__(self, number: types.Type) -> None:
-        self.number = number
+        self.number, self.width = number, 4 if number == types.int32 else WIDTH
         super().__init__(name=f"Lanes({number})")
 
 
@@ -38,7 +38,7 @@ class Lanes(types.Type):
 class _Model(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Lanes) -> None:
         one = ir.IntType(1) if kind.number == types.boolean else manager.lookup(kind.number).get_value_type()
-        super().__init__(manager, kind, ir.VectorType(one, WIDTH))
+        super().__init__(manager, kind, ir.VectorType(one, kind.width))
 
 
 MASK = Lanes(types.boolean)
@@ -53,9 +53,9 @@ def _broadcast(context: Any, builder: Any, value: Any, kind: Any, lanes: Lanes) 
     if isinstance(kind, Lanes):
         return value
     number = context.cast(builder, value, kind, lanes.number)
-    undefined = ir.Constant(ir.VectorType(number.type, WIDTH), ir.Undefined)
+    undefined = ir.Constant(ir.VectorType(number.type, lanes.width), ir.Undefined)
     first = builder.insert_element(undefined, number, ir.Constant(_WORD, 0))
-    return _shuffled(builder, first, undefined, [0] * WIDTH)
+    return _shuffled(builder, first, undefined, [0] * lanes.width)
 
 
 def _shuffled(builder: Any, a: Any, b: Any, places: Sequence[int]) -> Any:
@@ -65,7 +65,7 @@ def _shuffled(builder: Any, a: Any, b: Any, places: Sequence[int]) -> Any:
 
 def _lane_by_lane(operands: Sequence[Any], write: Callable[..., Any], result: Lanes | None = None) -> Any:
     """Signature and code generator of an elementwise intrinsic, from ``write(builder, *lanes)``; None without lanes."""
-    lanes = next((kind for kind in operands if isinstance(kind, Lanes) and kind != MASK), None)
+    lanes = min((kind for kind in operands if isinstance(kind, Lanes)), key=MASK.__eq__, default=None)
     if lanes is None:
         return None
 
@@ -94,23 +94,21 @@ def _operator(function: Callable[..., Any], write: Callable[..., Any], result: L
         return call if isinstance(a, Lanes) or isinstance(b, Lanes) else None
 
 
-def _compared(sign: str, builder: Any, a: Any, b: Any) -> Any:
-    return builder.fcmp_ordered(sign, a, b)
+def _by_kind(whole: str, real: str, *sign: str) -> Callable[..., Any]:
+    """Code generator of an instruction for whole numbers or for floats; of a comparison by its sign."""
+    return lambda builder, a, b: getattr(builder, whole if a.type.element == _WORD else real)(*sign, a, b)
 
 
-_operator(operator.add, lambda builder, a, b: builder.fadd(a, b))
-_operator(operator.sub, lambda builder, a, b: builder.fsub(a, b))
-_operator(operator.mul, lambda builder, a, b: builder.fmul(a, b))
+_compared = partial(_by_kind, "icmp_signed", "fcmp_ordered")
+_operator(operator.add, _by_kind("add", "fadd"))
+_operator(operator.sub, _by_kind("sub", "fsub"))
+_operator(operator.mul, _by_kind("mul", "fmul"))
 _operator(operator.truediv, lambda builder, a, b: builder.fdiv(a, b))
-_operator(operator.lt, partial(_compared, "<"), MASK)
-_operator(operator.gt, partial(_compared, ">"), MASK)
-_operator(operator.ge, partial(_compared, ">="), MASK)
-
-
-@_intrinsic
-def logical_and(typing: Any, a: Any, b: Any) -> Any:
-    """Mask of the lanes where ``a`` and ``b`` are true."""
-    return MASK(a, b), lambda context, builder, signature, arguments: builder.and_(*arguments)
+_operator(operator.rshift, lambda builder, a, b: builder.ashr(a, b))
+_operator(operator.and_, lambda builder, a, b: builder.and_(a, b))
+_operator(operator.lt, _compared("<"), MASK)
+_operator(operator.gt, _compared(">"), MASK)
+_operator(operator.ge, _compared(">="), MASK)
 
 
 @_intrinsic
@@ -134,7 +132,7 @@ def select(typing: Any, mask: Any, a: Any, b: Any) -> Any:
 @_intrinsic
 def minimum(typing: Any, a: Any, b: Any) -> Any:
     """The smaller of the two; ``b`` where one is NaN."""
-    return _lane_by_lane((a, b), lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))
+    return _lane_by_lane((a, b), lambda builder, a, b: builder.select(_compared("<")(builder, a, b), a, b))
 
 
 @_intrinsic
@@ -160,13 +158,12 @@ def _call(builder: Any, name: str, *lanes: Any) -> Any:
 def _address(context: Any, builder: Any, kind: Any, array: Any, place: Any) -> Any:
     """Address of an element of a C-contiguous array, as a pointer to lanes."""
     data = arrayobj.make_array(kind)(context, builder, array).data
-    lanes = ir.VectorType(context.get_data_type(kind.dtype), WIDTH)
-    return builder.bitcast(builder.gep(data, [place]), lanes.as_pointer())
+    return builder.bitcast(builder.gep(data, [place]), context.get_value_type(Lanes(kind.dtype)).as_pointer())
 
 
 @_intrinsic
 def load(typing: Any, array: Any, place: Any) -> Any:
-    """Load sixteen elements of a C-contiguous array, from flat index ``place`` on. Bounds are not checked."""
+    """Load the lanes of a C-contiguous array, from flat index ``place`` on. Bounds are not checked."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.load(_address(context, builder, array, *arguments), align=array.dtype.bitwidth // 8)
@@ -188,7 +185,7 @@ def broadcast(typing: Any, array: Any, place: Any) -> Any:
 
 @_intrinsic
 def store(typing: Any, array: Any, place: Any, values: Any) -> Any:
-    """Store lanes where :func:`load` would read them; a scalar is stored sixteen times."""
+    """Store lanes where :func:`load` would read them; a scalar is stored in all."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         lanes = _broadcast(context, builder, arguments[2], values, Lanes(array.dtype))

@@ -13,7 +13,7 @@ import os
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from threading import Timer
 from typing import Any
@@ -36,7 +36,7 @@ _noticed: list[Any] = []  # the loop whose compilation was announced: once for e
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
     """As :func:`compiled`, but inlined into the calling loop, which keeps lanes in registers."""
-    return compiled(function, forceinline=True)
+    return compiled(function, forceinline=True, _nrt=False)
 
 
 def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
@@ -54,6 +54,10 @@ def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]
         return njit(cache=True, **options)(function)
     except RuntimeError:  # neither the package's folder nor the user's is writable
         return njit(**options)(function)
+
+
+borrowing = partial(compiled, _nrt=False)
+"""As :func:`compiled`, for loops that make no arrays: they do not count who uses those that they are given."""
 
 
 def parallel_for(loop: Callable[..., None], count: int, *arguments: Any, min_per_thread: int = 1) -> None:
