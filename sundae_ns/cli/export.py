@@ -41,8 +41,7 @@ def export(
 ) -> int:
     """Write a scene as a web page with its head (.html or a folder), or its base colours as .ply, .spz, .sog or .glb.
 
-    The page needs no network and no server. The other formats hold no features and no head; antialiased scenes are
-    marked as such.
+    The page needs no network and no server. Other formats hold no features and no head, but mark antialiased scenes.
 
     Args:
         out: file to write; its suffix selects the format: .html, .ply or .glb (exact), .spz or .sog (quantised,

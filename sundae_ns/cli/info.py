@@ -19,8 +19,7 @@ def info(scene: Scene, cameras: File = None, json: Flag = False) -> int:
     """Say what a scene holds: Gaussians, bounds, marks, bytes, what cameras do not see, likely floaters, a crop box.
 
     Args:
-        cameras: a transforms.json, a COLMAP model (sparse/0), a camera path, a run or a packed scene, in place of the
-            scene's own or virtual cameras.
+        cameras: a transforms.json, a COLMAP model (sparse/0), a camera path, a run or packed scene, for its own.
         json: print one JSON object.
     """
     opened = load(scene).to(fastest_device())

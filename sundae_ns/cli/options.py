@@ -52,8 +52,7 @@ class Wishes:
     max_mb: Float = None
     """size of the finished file in MB, its head and the code of a page included, in place of a share."""
     crop: Annotated[Box | None, tyro.conf.arg(metavar="X Y Z X Y Z", help_behavior_hint="")] = None
-    """keep the Gaussians whose centres are in this box: its lowest x y z, then its highest, in the coordinates of the
-    file."""
+    """keep the Gaussians whose centres are in this box, in the file's coordinates: lowest x y z, then highest."""
     remove_floaters: Annotated[Float, tyro.conf.arg(metavar="[0 to 1]")] = None
     """remove what floats, and what no camera of the photographs sees: from 0, what surely does, to 1; bare 0.25."""
 
@@ -84,8 +83,7 @@ class Details:
     up: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z", help_behavior_hint="")] = None
     """direction that is upwards, for example 0 0 1; by default that of the scene, else of its cameras, else z."""
     start_view: Annotated[str | None, tyro.conf.arg(metavar="VIEW", help_behavior_hint="")] = None
-    """what a page opens with: index of a stored camera, or a camera file; by default that of the scene, else the first
-    camera."""
+    """what a page opens with: index of a stored camera, or a camera file; by default the scene's, else camera 0."""
     no_head: Flag = False
     """without the head: the scene is complete in viewers that have none."""
     seed: Int = None

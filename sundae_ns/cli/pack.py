@@ -17,10 +17,11 @@ from sundae_ns.cli.refusals import check_exclusive, check_file, check_least
 from sundae_ns.core.errors import ConfigError, SundaeError
 from sundae_ns.core.tables import MEGABYTE, without_nan
 from sundae_ns.io.config_file import check_run
-from sundae_ns.io.formats import PRIMITIVES, kind_of_gaussians
+from sundae_ns.io.formats import PRIMITIVES, kind_of, kind_of_gaussians
 from sundae_ns.io.pack.config import FINETUNED, FINETUNED_SIZE, PackConfig
 from sundae_ns.io.pack.packed_scene import Codecs, PackedScene, fit_scene, pack_bytes, write_fitted
 from sundae_ns.io.run_folder import files_of
+from sundae_ns.scene.cameras import spread
 from sundae_ns.scene.packing import contents_of
 
 if TYPE_CHECKING:
@@ -34,8 +35,7 @@ class PackDetails(SceneDetails):
     target_drop: Float = None
     """find the coarsest steps that lose at most this PSNR on some test views, dB."""
     finetune: int = 0
-    """training steps with quantisation in the loop before packing, for example 1000, for a smaller file; the run is not
-    changed."""
+    """training steps with quantisation in the loop, such as 1000, for a smaller file; they do not change the run."""
     max_cameras: int = 100
     """maximum number of training cameras to store for viewers; with 0, the capture is not needed."""
     json: Flag = False
@@ -52,7 +52,7 @@ def pack(
 
     Args:
         run: a run of sundae or splatfacto (its folder or config.yml), or a .ply, .spz, .sog, .glb, .splat,
-            .ksplat or gsplat's .pt.
+            .ksplat, gsplat's .pt, or a .sundae or its page (.html) to pack again.
         out: file to write, for example scene.sundae.
     """
     finetune, target_drop, max_mb = advanced.finetune, advanced.target_drop, wishes.max_mb
@@ -62,14 +62,17 @@ def pack(
     if wishes.cleans and (finetune or target_drop is not None):
         raise ConfigError(f"--finetune and --target-drop need the whole scene; leave out {wishes.cleans[0]}, or them")
     check_file(out, reads=[*files_of(run), advanced.data, advanced.cameras], overwrite=advanced.overwrite)
-    if (kind := kind_of_gaussians(run)) is None:
+    packed = kind_of(run) == "packed" or (run.suffix.lower() == ".html" and run.is_file())
+    if (kind := "packed" if packed else kind_of_gaussians(run)) is None:
         check_run(run)
     elif of_photos := words_of(advanced, "finetune", "target_drop", "data"):
-        raise ConfigError(f"{run} is a {PRIMITIVES[kind]} without photos; leave out {of_photos[0]}, or give a run")
+        name = PRIMITIVES.get(kind, "packed scene")
+        raise ConfigError(f"{run} is a {name} without photos; leave out {of_photos[0]}, or give a run")
     before = opened(run, wishes, advanced, capture=True, most=advanced.max_cameras)
     # A fine-tune shrinks the file, and the search below rounds it to its size.
     larger = None if max_mb is None else max_mb / (FINETUNED_SIZE if finetune else 1)
-    asked = before._replace(wishes=replace(wishes, max_mb=larger))
+    stored = tuple(before.scene.cameras[i] for i in spread(len(before.scene.cameras), advanced.max_cameras))
+    asked = before._replace(scene=replace(before.scene, cameras=stored), wishes=replace(wishes, max_mb=larger))
     left = asked.reduced(out.with_suffix(".sundae"), rounds=not finetune)
     source, packs = contents_of(left.stated), list[tuple[PackedScene, Codecs]]()
     figures: dict[str, Any] = {}

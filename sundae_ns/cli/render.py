@@ -17,7 +17,6 @@ from sundae_ns.scene.scene import image_of
 from sundae_ns.scene.scene import render as render_view
 
 IMAGES = (".png", ".jpg", ".jpeg", ".webp")
-SECONDS = 12.0
 
 
 def render(
@@ -33,8 +32,7 @@ def render(
 ) -> int:
     """Render a scene to an image, or along a path to a video.
 
-    Without --camera, a video is a film along a closed, smooth path through some of the cameras stored with the scene;
-    around it if there are none.
+    Without --camera, a video is a film along a closed, smooth path through some stored cameras, else around the scene.
 
     Args:
         out: image (.png, .jpg or .webp) or video (.mp4) to write.
@@ -58,7 +56,7 @@ def render(
         views, speed = read_cameras(camera, shown)
     elif video:
         with Console(stderr=True).status("Finding a path"):
-            views = film_views(shown, seconds=SECONDS if seconds is None else seconds, frames_per_second=fps or 24)
+            views = film_views(shown, seconds=12.0 if seconds is None else seconds, frames_per_second=fps or 24)
     elif view is None and shown.start is not None:
         views = [shown.start]
     views = [each if width is None else each.zoomed(width / each.width) for each in views]

@@ -20,7 +20,7 @@ from PIL import ExifTags, Image, ImageChops, ImageCms, ImageOps, TiffImagePlugin
 from sundae_ns.core.errors import DataError, reading, regular
 from sundae_ns.data.capture import beside
 
-HEIF = (".heic", ".heif")  # for which Pillow needs the package pillow-heif
+HEIF = (".heic", ".heif", ".hif")  # for which Pillow needs the package pillow-heif
 TURNED = (5, 6, 7, 8)  # EXIF orientations that swap width and height
 JPEG: dict[str, Any] = {"quality": 97, "subsampling": 0}
 REPAIR = "repair it or remove the view"
@@ -30,9 +30,8 @@ _MODES = {"CMYK": "CMYK", **dict.fromkeys(("1", "L", "LA", "I;16", "I;16B", "I;1
 _MODES |= dict.fromkeys(("P", "PA", "RGB", "RGBA", "YCbCr"), "RGB")
 PQ, HLG = 16, 18  # transfers
 HIGH_RANGE = (PQ, HLG)
-# Chromaticities of red, green and blue, here of BT.709 and sRGB; white is D65.
+# Chromaticities of red, green and blue, of BT.709 and sRGB, of BT.2020 and of Display P3; white is D65.
 _SRGB = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06)
-# Those of BT.2020 and Display P3.
 _PRIMARIES = {9: (0.708, 0.292, 0.170, 0.797, 0.131, 0.046), 12: (0.680, 0.320, 0.265, 0.690, 0.150, 0.060)}
 _ADOBE = 563 / 256, (0.64, 0.33, 0.21, 0.71, 0.15, 0.06)  # Adobe RGB (1998), an exponent and primaries
 _WHITE = 203.0  # cd/m2, of a white sheet (Report ITU-R BT.2408); HLG is for a display of 1,000
@@ -66,8 +65,11 @@ def opened(path: Path) -> Image.Image:
         image, end = Image.open(BytesIO(content)), max(content.find(b"IDAT"), 0)
         if (at := content.find(b"\0\0\0\4cICP", 0, end)) >= 0:
             image.info["cicp"] = content[at + 8 : at + 12]
-    elif image.format == "TIFF":  # Pillow would turn it as it is loaded
-        image.info[_TURN] = image.getexif().pop(ExifTags.Base.Orientation, 1)
+    elif image.format == "TIFF":
+        with suppress(EOFError):
+            while image.tag_v2.get(254, 0) & 1 and image.tell() < 8:  # a thumbnail in front of the photo
+                image.seek(image.tell() + 1)
+        image.info[_TURN] = image.getexif().pop(ExifTags.Base.Orientation, 1)  # else Pillow turns it as it is loaded
         image._size = getattr(image, "_tile_size", image.size)
     return image  # type: ignore[no-any-return]
 

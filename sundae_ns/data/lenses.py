@@ -68,8 +68,7 @@ def _refusal(model: str, where: str, otherwise: str = "") -> DataError:
 
 
 def kind_of_frame(stated: Mapping[str, Any], where: str) -> str:
-    """The kind of lens of a frame, from its entries over those of its file; errors as :func:`kind_of_model`."""
-    # instant-ngp's files have flags in place of a model.
+    """The kind of lens of a frame by its entries, in instant-ngp's files flags; errors as :func:`kind_of_model`."""
     flags = {"is_fisheye": "OPENCV_FISHEYE", "equirectangular": "EQUIRECTANGULAR", "latlong": "EQUIRECTANGULAR"}
     default = next((model for flag, model in flags.items() if stated.get(flag) is True), "OPENCV")
     return kind_of_model(stated.get("camera_model", default), where)

@@ -24,8 +24,7 @@ RAW = ".cr2"  # of Canon, which Pillow does not read
 SUFFIXES = (".jpg", ".jpeg", ".jfif", ".jpe", ".png", ".tif", ".tiff", ".webp", ".bmp", *HEIF, RAW)
 _OTHERS = tuple(".avif .jxl .jp2 .dng .nef .nrw .arw .cr3 .raf .orf .rw2 .pef .srw .exr .gif".split())  # are not read
 LEAST_PHOTOS = 3  # with a pose that a scene needs, because nerfstudio holds out at least one for test
-# Suffix of photos in a capture by Pillow's format; phones write MPO, a JPEG of several images. Others become JPEG, or
-# PNG if they have an alpha channel.
+# Suffix in a capture by Pillow's format (phones write MPO, several JPEG images); others become JPEG, with alpha PNG.
 _COPIED = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}
 _CONVERTED = ("TIFF", "WEBP", "BMP", "HEIF")
 _MASKS = ("masks", "mask")  # names of folders whose images are masks

@@ -37,33 +37,34 @@ def is_video(path: Path) -> bool:
 
 def check_video(path: Path) -> None:
     """Raise ``DataError`` if a video cannot be decoded, has too few frames, or colours that cannot be converted."""
-    length, first = _length(path), next(_frames(path), None)
+    (length, aspect), first = _facts(path), next(_frames(path), None)
     if first is None:
         raise DataError(f"{path} has no frame that can be decoded; {_CONVERT}")
     if length < LEAST_PHOTOS:
         raise DataError(f"{path} has {length} frames, and camera poses need {LEAST_PHOTOS} or more; give a longer one")
-    check_shape(path, image_of(first, path).size)
+    check_shape(path, image_of(first, path, aspect).size)
 
 
 def write_frames(path: Path, folder: Path, count: int, advance: Callable[[int], None]) -> None:
     """Write the sharpest frame of each of ``count`` stretches of a video to a folder, which appears at the end."""
-    partial, written = folder.with_name(f"{folder.name}.partial"), 0
+    partial, written, (length, aspect) = folder.with_name(f"{folder.name}.partial"), 0, _facts(path)
     with writing(f"cannot write {folder}"):
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
-        for written, frame in enumerate(_sharpest(path, count), start=1):
-            image_of(frame, path).save(partial / f"{written:05d}.jpg", **JPEG)
+        for written, frame in enumerate(_sharpest(path, count, max(length, 1)), start=1):
+            image_of(frame, path, aspect).save(partial / f"{written:05d}.jpg", **JPEG)
             advance(1)
         if written < LEAST_PHOTOS:
             raise DataError(f"{path} ends after {written} frames that can be decoded; {_CONVERT}")
         partial.replace(folder)
 
 
-def image_of(frame: Any, path: Path) -> Image.Image:
+def image_of(frame: Any, path: Path, aspect: float = 1.0) -> Image.Image:
     """A frame (``av.VideoFrame``) as an upright image in sRGB; ``DataError`` if it states colours not known here.
 
     Its own matrix and range count; without a matrix BT.709 from 1280 x 577 on and BT.601 below, as in players. A high
-    dynamic range is rolled off; other transfers are shown as they are, and so are wide gamuts.
+    dynamic range is rolled off; other transfers are shown as they are, and so are wide gamuts. Pixels whose width is
+    ``aspect`` times their height become square.
     """
     matrix, transfer = int(frame.colorspace), int(frame.color_trc)
     if matrix in _UNSTATED:
@@ -72,7 +73,8 @@ def image_of(frame: Any, path: Path) -> Image.Image:
         what = f"{_NOT_SHOWN[transfer]} light" if transfer in _NOT_SHOWN else f"a colour matrix of number {matrix}"
         raise DataError(f"{path} has {what}, which is not read; convert it to BT.709, for example with HandBrake")
     kind = "rgb48le" if transfer in HIGH_RANGE else "rgb24"
-    pixels = frame.reformat(format=kind, src_colorspace=matrix, src_color_range=int(frame.color_range)).to_ndarray()
+    size = round(frame.width * max(aspect, 1.0)), round(frame.height / min(aspect, 1.0))
+    pixels = frame.reformat(*size, kind, src_colorspace=matrix, src_color_range=int(frame.color_range)).to_ndarray()
     if transfer in HIGH_RANGE:
         pixels = to_srgb_values(pixels, transfer, int(frame.color_primaries))
     for data in frame.side_data:
@@ -128,15 +130,16 @@ def _frames(path: Path) -> Iterator[Any]:
             yield from filtered(None)
 
 
-def _length(path: Path) -> int:
-    """Number of frames: as the file states, or counted."""
+def _facts(path: Path) -> tuple[int, float]:
+    """Number of frames, as the file states or counted; and width of a pixel as a share of its height."""
     with _opened(path) as (container, video):
-        return video.frames or sum(packet.size > 0 for packet in container.demux(video))
+        aspect = float(video.sample_aspect_ratio or 1)
+        length = video.frames or sum(packet.size > 0 for packet in container.demux(video))
+    return length, aspect if 0.5 <= aspect <= 2 else 1.0  # no format of videos uses others
 
 
-def _sharpest(path: Path, count: int) -> Iterator[Any]:
-    """The sharpest of 12 frames of each of ``count`` equal stretches of a video."""
-    length = max(_length(path), 1)
+def _sharpest(path: Path, count: int, length: int) -> Iterator[Any]:
+    """The sharpest of 12 frames of each of ``count`` equal stretches of a video of some length."""
     count = min(count, length)
     every = max(1, length // (count * 12))
     # A file may hold more frames than it states; they belong to the last stretch.

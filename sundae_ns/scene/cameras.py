@@ -42,10 +42,8 @@ def cameras_of(path: Path | str, scene: Scene | None = None) -> list[Camera]:
     """The cameras of a file, as ideal pinhole cameras: distortion is left out.
 
     Args:
-        path: a ``transforms.json``, the folder with one, a COLMAP model (such as ``sparse/0``), or a camera path of
-            nerfstudio's viewer (``.json``).
-        scene: whose coordinates the cameras get. A scene of a run needs it for the cameras of its capture, because
-            training has moved and scaled them.
+        path: a ``transforms.json``, its folder, a COLMAP model (``sparse/0``), or a camera path of nerfstudio's viewer.
+        scene: whose coordinates the cameras get; needed for a run's scene, as training moves and scales its capture.
 
     Raises:
         DataError: the file is missing, damaged, or holds no cameras.
@@ -146,10 +144,7 @@ def spread(total: int, most: int) -> list[int]:
 
 
 def with_start(scene: Scene, start_view: str | None, up: Sequence[float] | None) -> Scene:
-    """The scene with another start view or up axis, as a user names them; None keeps that of the scene.
-
-    ``start_view`` is the index of a stored camera (else ``ConfigError``), or a file whose first camera it is.
-    """
+    """The scene with another up axis or start view, an index of a stored camera (else ``ConfigError``) or a file."""
     scene = scene if up is None else dataclasses.replace(scene, up=unit(up))
     if start_view is None:
         return scene

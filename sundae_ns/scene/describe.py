@@ -23,6 +23,7 @@ from sundae_ns.io.formats import METAS, kind_of, kind_of_gaussians
 from sundae_ns.io.pack.container import read_header
 from sundae_ns.scene.cameras import spread
 from sundae_ns.scene.compose import floater_mask, for_cleaning
+from sundae_ns.scene.page import opened_page
 from sundae_ns.scene.prune_scene import at_most, weights_in
 from sundae_ns.scene.scene import Scene, image_of, render
 from sundae_ns.scene.virtual_cameras import by_device, virtual_cameras
@@ -65,8 +66,7 @@ def describe(
     """Facts of a scene that was loaded from a path, as plain values for JSON; lengths are in units of the scene.
 
     ``invisible`` is the share of the Gaussians that no camera sees, ``floaters`` how many a cleaning would remove, and
-    ``crop`` a box, lowest corner first, that holds 99% of what the cameras see. They are ``cameras``, by default those
-    stored with the scene, else virtual ones.
+    ``crop`` a box, lowest corner first, of 99% of what they see. Cameras are by default the stored, else virtual ones.
     """
     gaussians, cameras = scene.gaussians, cameras or scene.cameras
     views = for_cleaning(cameras) or virtual_cameras(scene, LOOKING)
@@ -94,11 +94,15 @@ def describe(
 
 
 def bytes_by_attribute(scene: Scene, path: Path) -> dict[str, int]:
-    """Bytes of each part of a packed scene or a .sog in its file; of other files, of the Gaussians in fp32."""
+    """Bytes of each part of a packed scene, a page or a .sog in its file; of others, of the Gaussians in fp32."""
     parts = Counter[str]()
-    if kind_of(path) == "packed":
+    if path.suffix.lower() == ".html":
+        with opened_page(path) as packed:
+            parts |= bytes_by_attribute(scene, packed)
+        parts["page"] = path.stat().st_size - parts.total()
+    elif kind_of(path) == "packed":
         for name, section in read_header(path).sections.items():
-            parts[name.split("/")[0]] += section.size
+            parts[name.split("/")[0]] += sum(section.parts)
     elif kind_of(path) == "sog":
         with zipfile.ZipFile(path) as bundle:
             for entry in bundle.infolist():
@@ -112,8 +116,7 @@ def bytes_by_attribute(scene: Scene, path: Path) -> dict[str, int]:
 def box_of(means: Tensor, weights: Tensor, share: float = 0.99) -> list[float]:
     """A box, lowest and highest x, y and z, that holds at least a share of weights ``[N]`` at centres ``[N, 3]``.
 
-    Each face cuts off at most a sixth of the rest. Its numbers are rounded outwards, to a thousandth of the longest
-    side or less.
+    Each face cuts off at most a sixth of the rest. Numbers are rounded outwards, by a thousandth of the longest side.
     """
     sides = []
     for values in means.T:

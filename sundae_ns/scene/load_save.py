@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -22,7 +21,7 @@ from sundae_ns.io.formats import FORMATS, kind_of
 from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.io.ply import Marks
 from sundae_ns.scene.cameras import is_frame
-from sundae_ns.scene.page import packed_in, packed_of, write_page
+from sundae_ns.scene.page import opened_page, packed_of, write_page
 from sundae_ns.scene.scene import Scene
 
 SUFFIXES = (*FORMATS, ".sundae", ".html")  # of the files that save() writes
@@ -32,8 +31,7 @@ FRAME_FILE = "dataparser_transforms.json"  # of nerfstudio, in the folder of a r
 def load(path: Path | str, *, device: torch.device | str = "cpu") -> Scene:
     """Open a finished scene. Nothing in its files is executed, and nerfstudio is not needed.
 
-    Opacities of 0 or 1 and widths of 0 become finite. Other Gaussians that are NaN or infinite are dropped. A warning
-    says how many.
+    Opacities of 0 or 1 and widths of 0 become finite; other NaN or infinite Gaussians are dropped, with a warning.
 
     Args:
         path: a ``.ply``, also a compressed one, a ``.spz``, ``.sog`` (a ``lod-meta.json`` too), ``.glb``, ``.splat`` or
@@ -63,9 +61,7 @@ def load_with_mask(path: Path, device: torch.device | str = "cpu") -> tuple[Scen
 
         return scene_of(read_scene(path)).to(device), None
     if path.suffix.lower() == ".html":
-        with TemporaryDirectory() as folder:
-            packed = Path(folder, f"{path.stem}.sundae")
-            packed.write_bytes(packed_in(path))
+        with opened_page(path) as packed:
             return load_with_mask(packed, device)
     if formats.kind_of_gaussians(path) is None:
         if (config := find_config(path)) is None:
@@ -91,8 +87,7 @@ def save(scene: Scene, path: Path | str, *, upright: bool = False, config: PackC
     Args:
         scene: any device.
         path: file to write; a missing folder of it is made.
-        upright: turn from nerfstudio's z-up axes to the -y-up axes of viewers; ``.ply``, ``.spz`` and ``.sog`` only. A
-            ``.glb`` is upright in any case.
+        upright: turn from nerfstudio's z-up axes to the -y-up axes of viewers; not a ``.glb``, which is always upright.
         config: precision of a packed scene or of that in a page; by default ``PackConfig()``.
 
     Raises:

@@ -12,10 +12,12 @@ import io
 import json
 import logging
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from PIL import Image
 
@@ -76,11 +78,15 @@ def write_page(path: Path, *shown: Shown, views: Mapping[str, View] | None = Non
     return sum(map(len, files.values()))
 
 
-def packed_in(page: Path) -> bytes:
-    """The packed file of the first scene in a page of one file; ``PackError`` if there is none."""
+@contextmanager
+def opened_page(page: Path) -> Iterator[Path]:
+    """The first scene in a page of one file, as a packed file for a while; ``PackError`` if there is none."""
     with reading(page, "a page with its scene", PackError, remedy="give the scene that it was made of"):
-        content = page.read_text(encoding="utf-8").partition('class="scene"')[2]
-        return base64.b64decode(content.partition(">")[2].partition("<")[0] or "none", validate=True)
+        text = page.read_text(encoding="utf-8").partition('class="scene"')[2].partition(">")[2].partition("<")[0]
+        content = base64.b64decode(text or "?", validate=True)
+    with TemporaryDirectory() as folder:
+        (packed := Path(folder, f"{page.stem}.sundae")).write_bytes(content)
+        yield packed
 
 
 def page_of(*shown: Shown, views: Mapping[str, View] | None = None, files: Sequence[str] = ()) -> str:
@@ -151,8 +157,7 @@ class Embedded:
 def show(scene: Scene, *, height: int = 480, title: str = "Scene") -> Embedded:
     """The web page of a scene as the output of a notebook's cell, head included.
 
-    The page contains the scene, packed with default settings. The notebook stores it; a page of more than 10 MB is
-    logged as a warning.
+    The page, which the notebook stores, contains the scene, packed by default settings; of over 10 MB it warns.
 
     Args:
         scene: any device.

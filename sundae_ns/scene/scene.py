@@ -368,9 +368,8 @@ def measure(
 
     Args:
         scene: to measure.
-        reference: a scene, whose own images count as true, or an image for each camera: the path of a photo, an image
-            of PIL, or an array or a tensor ``[H, W, 3]``, uint8 or in [0, 1]. Both scenes are rendered over the
-            background of the reference.
+        reference: a scene, whose own images count as true and over whose background both are rendered; or an image for
+            each camera: the path of a photo, an image of PIL, an array or a tensor ``[H, W, 3]``, uint8 or in [0, 1].
         cameras: the cameras; by default those stored with the reference, or with the scene.
         head: whether the heads of both scenes correct their images.
         backend: the rasteriser.

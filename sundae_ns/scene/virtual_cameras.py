@@ -185,8 +185,7 @@ def _probe(gaussians: Gaussians, middle: Tensor, reach: float, generator: torch.
 
 def _factor(values: Tensor, count: int) -> Tensor:
     """The factor at which values ``[N]``, limited to 1 each, have the sum ``count < N``."""
-    # With the largest k values at 1, the others share what is left. The sum is the least of these sums over k, so the
-    # factor is the largest of theirs.
+    # With the largest k values at 1, the others share the rest. The sum is the least over k, so the factor is the most.
     left = count - torch.arange(count, dtype=values.dtype, device=values.device)
     return (left / values.sort().values.cumsum(0).flip(0)[:count].clamp_min(1e-290)).amax()
 

@@ -85,9 +85,13 @@ def test_commands_say_what_a_change_costs(folder, capsys, monkeypatch):
     assert sn.load("b.html").num_gaussians == 150
 
 
+def facts_of(path, capsys):
+    assert run("info", path, "--json") == 0
+    return json.loads(capsys.readouterr().out.splitlines()[-1])
+
+
 def test_info_says_what_a_file_holds(folder, capsys):
-    assert run("info", folder / "whole.ply", "--json") == 0
-    facts, scene = json.loads(capsys.readouterr().out.splitlines()[-1]), sn.load(folder / "whole.ply")
+    facts, scene = facts_of(folder / "whole.ply", capsys), sn.load(folder / "whole.ply")
     assert (facts["gaussians"], facts["sh_degree"], facts["stored_cameras"]) == (300, 0, 0)
     assert sum(facts["bytes_by_attribute"].values()) == bytes_of(scene.gaussians)
     assert facts["low"] == pytest.approx(scene.gaussians["means"].amin(dim=0).tolist())
@@ -100,6 +104,16 @@ def test_info_says_what_a_file_holds(folder, capsys):
     assert sn.load(folder / "cut.spz").num_gaussians > 290
     capsys.readouterr()
     assert "nothing.ply cannot be read" in refusal(capsys, "info", folder / "nothing.ply")
+
+
+def test_a_packed_scene_and_its_page_are_packed_again(folder, tmp_path, capsys):
+    """A page holds the bytes of its scene, in base64, and its code."""
+    whole, page, again = folder / "whole.sundae", tmp_path / "page.html", tmp_path / "again.sundae"
+    assert run("export", whole, "-o", page) == run("pack", page, "-o", again, "--max-cameras", 1) == 0
+    parts, packed = (facts_of(path, capsys)["bytes_by_attribute"] for path in (page, whole))
+    assert parts.pop("page") > 1.3 * whole.stat().st_size > 1.3 * sum(packed.values())
+    assert parts == packed
+    assert [facts_of(again, capsys)[name] for name in ("gaussians", "stored_cameras")] == [300, 1]
 
 
 def test_a_box_holds_the_share_that_is_asked_for():

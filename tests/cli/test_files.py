@@ -163,14 +163,15 @@ def test_prune_by_the_cameras_of_files(tmp_path, capsys):
     stored = sn.virtual_cameras(scene, 3, size=32)
     sn.save(dataclasses.replace(scene, cameras=tuple(stored)), tmp_path / "a.sundae")
     write_model(tmp_path / "sparse", ["a.png", "b.png"], (32, 24))
-    frame = {"transform_matrix": [[1, 0, 0, 0.5], [0, 1, 0, 0.5], [0, 0, 1, 3], [0, 0, 0, 1]]}
+    frame = {"transform_matrix": [[1, 0, 0, 2.0], [0, 1, 0, 0.5], [0, 0, 1, 3], [0, 0, 0, 1]]}
     frame |= {"fl_x": 30, "fl_y": 30, "cx": 16, "cy": 12, "w": 32, "h": 24}
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
     for name, number in (("a.sundae", 3), ("sparse", 2), ("transforms.json", 1)):
         arguments = ["prune", tmp_path / "a.ply", "-o", tmp_path / "out.spz", "--cameras", tmp_path / name]
         assert run(*arguments, "--count", "50", "--overwrite") == 0
         text = capsys.readouterr().out
-        assert f"{number} cameras see " in text
+        seen = re.search(rf"{number} cameras see ([\d.]+)% of the Gaussians(; if the cameras are not in)?", text)
+        assert (seen[2] is not None) == (float(seen[1]) < 86) == (name == "transforms.json")
         assert "50 of 200 Gaussians" in text
     words = ("-o", tmp_path / "transforms.json", "--cameras", tmp_path, "--overwrite")
     assert run("prune", tmp_path / "a.ply", *words) == 2

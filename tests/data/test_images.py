@@ -156,6 +156,12 @@ def grey12(path):
     path.write_bytes(struct.pack("<2sHIH", b"II", 42, 8, len(tags)) + table.ljust(100, b"\0") + pixels)
 
 
+def after_a_thumbnail(path):
+    """A TIFF of two pages, as scanners and cameras write them."""
+    tifffile.imwrite(path, SAME[::4, ::4].astype(np.uint8), photometric="rgb", subfiletype=1)
+    tifffile.imwrite(path, SAME.astype(np.uint8), photometric="rgb", append=True)
+
+
 def with_profile(mode, space):
     icc = space if isinstance(space, bytes) else profile(space)
     return lambda path: patches().convert(mode).save(path, icc_profile=icc)
@@ -168,6 +174,7 @@ TYPES = {
     "12 bits": (grey12, "L", GREY),
     "16 bits in planes": (partial(tifffile.imwrite, data=PLANES, planarconfig="separate"), "RGB", SAME),
     "white is 0": (partial(tifffile.imwrite, data=65535 - PLANES[0], photometric="miniswhite"), "L", RED),
+    "a thumbnail first": (after_a_thumbnail, "RGB", SAME),
     "a palette": (lambda path: patches().quantize(64).save(path), "RGB", SAME),
     "grey and alpha": (lambda path: patches().convert("LA").save(path), "RGBA", GREY),
     "CMYK": (lambda path: patches().convert("CMYK").save(path, format="TIFF"), "RGB", SAME),

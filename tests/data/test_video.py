@@ -2,6 +2,8 @@
 
 import os
 import struct
+from fractions import Fraction
+from unittest.mock import Mock
 
 import av
 import numpy as np
@@ -10,7 +12,7 @@ from limits import refused
 from PIL import Image
 from run_commands import write_video
 
-from sundae_ns.data.video import _length, check_video, image_of, is_video, write_frames
+from sundae_ns.data.video import _facts, check_video, image_of, is_video, write_frames
 
 PATCHES = [(200, 30, 40), (30, 190, 60), (20, 40, 220), (240, 240, 240), (128, 128, 128), (250, 220, 20)]
 
@@ -22,31 +24,19 @@ def patches(width=192, height=64):
     return image
 
 
-def write_colours(
-    path,
-    images,
-    matrix=2,
-    full=False,
-    *,
-    pixels="yuv420p",
-    codec="libx264",
-    transfer=2,
-    turn=None,
-    tag=None,
-    flags=0,
-    title="",
-):
+def write_colours(path, images, matrix=2, full=False, *, pixels="yuv420p", codec="libx264", turn=None, **marks):
     """Write a video of images, which are converted and marked by a matrix, a range and a transfer."""
     with av.open(str(path), "w") as container:
-        container.metadata["title"] = title
+        container.metadata["title"] = marks.get("title", "")
         video = container.add_stream(codec, rate=10)
         video.height, video.width = images[0].shape[:2]
         video.pix_fmt = pixels
         video.options = {"crf": "1", "x265-params": "log-level=0:crf=1"}
         coder = video.codec_context
-        coder.colorspace, coder.color_range, coder.color_trc = matrix, 1 + full, transfer
-        coder.flags |= flags
-        coder.codec_tag = tag or coder.codec_tag
+        coder.colorspace, coder.color_range, coder.color_trc = matrix, 1 + full, marks.get("transfer", 2)
+        coder.flags |= marks.get("flags", 0)
+        coder.sample_aspect_ratio = marks.get("aspect", 1)
+        coder.codec_tag = marks.get("tag") or coder.codec_tag
         if turn is not None:
             video.set_display_rotation(turn[0], hflip=turn[1])
         options = {"dst_colorspace": matrix if matrix in (1, 5, 9) else 5, "dst_color_range": 1 + full}
@@ -120,6 +110,14 @@ def test_frames_are_upright(tmp_path, degrees, flip):
     assert np.median(np.abs(frame - np.asarray(upright))) <= 3
 
 
+@pytest.mark.parametrize(("aspect", "size"), [("4/3", (256, 64)), ("1/2", (192, 128)), ("9", (192, 64))])
+def test_pixels_become_square(tmp_path, aspect, size):
+    write_colours(tmp_path / "a.mkv", 5 * [patches()], 5, aspect=Fraction(aspect))
+    (frame, *_) = frames_from(tmp_path / "a.mkv")
+    assert frame.shape[1::-1] == size
+    assert np.abs(frame[3 * size[1] // 4, size[0] // 12 :: size[0] // 6] - PATCHES).max() <= 4
+
+
 def test_interlaced_frames_have_no_comb(tmp_path):
     """Fields of 1/20 s apart: a bar moves by 24 pixels between the lines of one and of the other."""
     path, images = tmp_path / "a.mkv", [np.full((64, 288, 3), 40, np.uint8) for _ in range(5)]
@@ -149,26 +147,17 @@ def test_the_sharpest_frame_of_each_stretch(tmp_path):
 @pytest.mark.parametrize("name", ["a.mkv", "a.mts", "a.ts", "a.flv", "\udcff.mp4"])
 def test_frames_are_counted_where_no_length_is_stated(tmp_path, name):
     write_colours(tmp_path / name, 5 * [patches()], 1)
-    assert _length(tmp_path / name) == 5
+    assert _facts(tmp_path / name) == (5, 1)
 
 
 def test_all_frames_of_a_short_video_are_there_only_once_they_are_whole(tmp_path):
     write_video(tmp_path / "a.mp4", 7)
-
-    def stop(count):
-        raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        frames_from(tmp_path / "a.mp4", 150, stop)
+        frames_from(tmp_path / "a.mp4", 150, Mock(side_effect=KeyboardInterrupt))
     assert not (tmp_path / "a").exists()
     frames_from(tmp_path / "a.mp4", 150)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "a.mp4"]
     assert [path.name for path in sorted((tmp_path / "a").iterdir())] == [f"{i:05d}.jpg" for i in range(1, 8)]
-
-
-def half(path):
-    write_video(path, 40)
-    path.write_bytes(path.read_bytes()[:400])
 
 
 def sound(path):
@@ -217,7 +206,7 @@ UNREADABLE = "is not a video that FFmpeg decodes .*; convert it to .mp4"
 REFUSED = {
     "text": (lambda path: path.write_text("not a video"), UNREADABLE),
     "empty": (lambda path: path.touch(), UNREADABLE),
-    "half": (half, UNREADABLE),
+    "half": (lambda path: (write_video(path, 40), path.write_bytes(path.read_bytes()[:400])), UNREADABLE),
     "a pipe": (os.mkfifo, "it is a pipe or a device"),
     "sound": (sound, "has no images"),
     "an unknown codec": (replaced(b"avc1", b"zzzz"), "has no images that can be decoded; convert it"),

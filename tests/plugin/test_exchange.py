@@ -230,10 +230,7 @@ def test_two_ranks(folder, name, passed):
     passed(folder, name)
 
 
-@given(
-    seed=st.integers(0, 10**6),
-    shape=st.sampled_from([(64, 48, 50.0, 32.0, 2.0), (300, 20, 20.0, -40.0, 6.0)]),
-)
+@given(seed=st.integers(0, 10**6), shape=st.sampled_from([(64, 48, 50.0, 32.0, 2.0), (300, 20, 20.0, -40.0, 6.0)]))
 def test_all_rendered_gaussians_may_be_seen(seed, shape):
     """Centres all around a camera, some of them very near; sizes over four decades."""
     width, height, focal, cx, most = shape

@@ -154,8 +154,7 @@ def test_a_lens_that_sees_the_half_space(capture, load, edit, focal, k1):
 
 
 @pytest.mark.parametrize(
-    "entries",
-    [{"p1": 1.0}, {"k4": -90000.0}, {"camera_model": "OPENCV_FISHEYE", "k1": -3.0}, {"k1": 300.0, "k2": 1e9}],
+    "entries", [{"p1": 1.0}, {"k4": -90000.0}, {"camera_model": "OPENCV_FISHEYE", "k1": -3.0}, {"k1": 300.0, "k2": 1e9}]
 )
 def test_a_distortion_that_leaves_no_image_is_refused(capture, load, edit, entries):
     edit(capture, **entries)

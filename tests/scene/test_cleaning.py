@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 
 import pytest
 import torch
@@ -51,11 +52,14 @@ def test_planted_floaters_vanish_and_the_surface_stays(factor, with_views):
         assert sn.measure(whole, truth).psnr < 35
 
 
-def test_what_no_view_sees_goes_and_no_image_changes():
+def test_what_no_view_sees_goes_and_no_image_changes(caplog):
     """A second wall right behind the first, and one behind the cameras; both touch themselves."""
     hidden = torch.cat([wall() * 0.5 + torch.tensor([0.0, 0.9, 0.0]), wall() + torch.tensor([0.0, -9.0, 0.0])])
     whole = scene_of(torch.cat([wall(), hidden]), 0.12)
+    floater_mask(whole[:4200], VIEWS, 0.5)
+    assert not caplog.messages
     found = floater_mask(whole, VIEWS, 0.5)
+    assert re.fullmatch(r"no camera sees [78],\d+ of 12,000 Gaussians, which go; if the .*", caplog.messages[0])
     assert float(found[:4000].float().mean()) < 0.05
     assert float(found[4000:8000].float().mean()) > 0.9
     assert bool(found[8000:].all())

@@ -178,10 +178,7 @@ def rates(made, steps, prune_at=None, *, name="means", primitives=SPARSE):
 
 @pytest.mark.parametrize(
     ("shape", "middle"),
-    [
-        ("exponential", {50: 1e-3}),
-        ("cosine", {25: 1e-4 + 0.99e-2 * (1 + 0.5**0.5) / 2, 50: (1e-2 + 1e-4) / 2}),
-    ],
+    [("exponential", {50: 1e-3}), ("cosine", {25: 1e-4 + 0.99e-2 * (1 + 0.5**0.5) / 2, 50: (1e-2 + 1e-4) / 2})],
 )
 def test_from_first_to_last(shape, middle):
     found = rates(scheduler(shape=shape), 130)
