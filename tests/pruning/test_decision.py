@@ -300,7 +300,8 @@ def test_prune_leaves_what_the_decision_says_and_the_field_alone(rule):
 
 
 def test_invalid_input_raises_one_line():
-    params, three = gaussians(), draws(score=lambda _: torch.ones(3))
+    params, three, spoilt = gaussians(), draws(score=lambda _: torch.ones(3)), draws(score=opacity)
+    spoilt.gamma = 2.0
     cases = [
         (DataError, "1 Gaussians cannot have 1 neighbours", lambda: response(gaussians(1), PAPER)),
         (DataError, "none of 60", lambda: decide_share({k: v * torch.nan for k, v in params.items()}, PAPER)),
@@ -308,7 +309,7 @@ def test_invalid_input_raises_one_line():
         (ConfigError, "set redistribution to none", lambda: decide_share(params, draws(score="response"))),
         (DataError, r"shape \[59\] for 60", lambda: decide_share(params, DEFAULT, 0.1, torch.ones(59))),
         (ConfigError, "gamma", lambda: decide_share(params, draws(gamma=2.0))),
-        (ConfigError, "gamma", lambda: decide(params, draws(score=opacity, gamma=2.0), 6)),
+        (ConfigError, "gamma", lambda: decide(params, spoilt, 6)),
         (DataError, r"score has shape \[3\] for 60", lambda: decide(params, three, 6)),
     ]
     for error, message, call in cases:

@@ -121,6 +121,7 @@ def test_the_bound_of_rotations_is_nearly_reached():
     turned, _ = module.aligned(q, np.zeros((len(q), 3), np.float32))
     worst = angles(turned.astype(np.float64), through_rotations(q, 0.01).astype(np.float64)).max()
     assert 0.85 * module.rotation_bound(0.01) < worst <= module.rotation_bound(0.01)
+    assert (module._normalized(torch.from_numpy(q).double())[:, 0] >= 0).all(), "w is not stored"
     # A quaternion of length zero is the identity.
     assert np.array_equal(through_rotations(np.zeros((2, 4), np.float32), 0.01), [[1, 0, 0, 0]] * 2)
 
