@@ -28,7 +28,7 @@ from sundae_ns.io.pack.container import Array, Coded, Floats, Levels
 from sundae_ns.io.pack.entropy import LARGEST
 
 _UNIT = 127  # a basis is stored in these parts of a step
-_CHUNK = 1 << 16  # rows expanded at once
+_CHUNK, _PART = 1 << 16, 1 << 13  # rows expanded at once, and, as new memory takes a CPU long, transformed
 _LEAST_EIGENVALUE = 0.02  # of a form, relative to the mean: other cameras see more of these errors
 _LOGITS = (-6.0, 8.0)  # opacities outside look the same as at these: below 1/255 nothing is drawn
 _STEPS = {
@@ -191,13 +191,14 @@ class Transform:
         return (rows.double() - self.mean.double()) @ self.inverse / self.step
 
     def with_step(self, step: float, rows: Floats) -> Transform:
-        """The same basis with another step, or a larger one where the largest coefficient of rows would not fit."""
-        other = replace(self, step=step)
-        highest = float(other.coefficients(torch.from_numpy(rows)).abs().max())
+        """The same basis with another step, or a larger one where the largest coefficient of rows might not fit."""
+        reach = torch.from_numpy(np.maximum(rows.max(axis=0), -rows.min(axis=0))) + self.mean.abs()
+        highest = float((reach.double() @ self.inverse.abs()).max()) / step  # at most
         return replace(self, step=step * max(2 * highest / LARGEST, 1.0))
 
     def _levels(self, rows: Tensor) -> Tensor:
-        return self.coefficients(rows).round().clamp(-LARGEST, LARGEST)
+        parts = (self.coefficients(part) for part in rows.split(_PART if rows.is_cpu else len(rows)))
+        return torch.cat([part.round_().clamp_(-LARGEST, LARGEST).float() for part in parts])
 
 
 def fit_transform(rows: Floats, step: float, *, centred: bool = True, form: Tensor | None = None) -> Transform:
@@ -207,14 +208,15 @@ def fit_transform(rows: Floats, step: float, *, centred: bool = True, form: Tens
     keep zeros exact. ``form`` ``[D, D]``, positive definite, weighs errors e of rows by e' form e; coefficients are
     uncorrelated where this is the squared length. None or zeros stand for the identity.
     """
-    values = rows.astype(np.float64)
-    mean = (values.mean(axis=0) if centred else np.zeros(rows.shape[1])).astype(np.float32)
-    values = values - mean
+    mean = (rows.mean(axis=0, dtype=np.float64) if centred else np.zeros(rows.shape[1])).astype(np.float32)
     root, back = _roots(rows.shape[1], form)
-    values = values @ root
-    # Divide rows by the square root of their length, so that a few huge rows do not dominate the basis.
-    shrunk = values / np.sqrt(np.maximum(np.linalg.norm(values, axis=1, keepdims=True), step))
-    axes = np.linalg.eigh(shrunk.T @ shrunk)[1][:, ::-1].T @ back
+    products = np.zeros_like(root)
+    for start in range(0, len(rows), _PART):
+        values = (rows[start : start + _PART].astype(np.float64) - mean) @ root
+        # Divide rows by the square root of their length, so that a few huge rows do not dominate the basis.
+        values /= np.sqrt(np.maximum(np.linalg.norm(values, axis=1, keepdims=True), step))
+        products += values.T @ values
+    axes = np.linalg.eigh(products)[1][:, ::-1].T @ back
     largest = float(np.abs(axes).max()) if form is not None else 1.0
     # Contiguous, as from a file: products of other layouts round differently.
     basis = np.ascontiguousarray(np.rint(axes / largest * _UNIT).astype(np.int8))

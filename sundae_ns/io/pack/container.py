@@ -53,6 +53,7 @@ LIMITS: dict[str, int] = FORMAT["limits"]
 VERSION, MAX_HEADER, SPARE, MAX_RATIO = (LIMITS[name] for name in ("version", "header", "spare", "ratio"))
 MAGIC = b"\x89SUNDAE\n"
 PADDING = "padding"
+_TRIED = 1 << 14  # bytes of a plane that tell whether to deflate it
 _PREAMBLE = struct.Struct("<8sII32s")
 
 Array = NDArray[Any]
@@ -181,6 +182,8 @@ def split_planes(array: Array) -> list[bytes]:
 
 
 def _deflated(plane: bytes) -> bytes:
+    if len(plane) < 5 or (len(plane) > _TRIED and len(_deflated(plane[:_TRIED])) == _TRIED):
+        return plane  # too short, or, like the entropy coder's, without redundancy
     deflate = zlib.compressobj(9, wbits=-15)
     stream = deflate.compress(plane) + deflate.flush()
     return stream if len(stream) < len(plane) else plane

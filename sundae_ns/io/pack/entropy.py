@@ -75,8 +75,7 @@ def _decided(coder, stream, chances, kinds, row, node, bit):  # type: ignore[no-
     model, weights, at_hand = chances
     # Unsigned: of other numbers numba asks whether they count from the end.
     a, b = np.uint32(kinds[0] * _NODES + node), np.uint32(kinds[1] * _NODES + node)
-    c, d = np.uint32(kinds[2] * _NODES + node), np.uint32(kinds[3] * _NODES + node)
-    row = np.uint32(row)
+    c, d, row = np.uint32(kinds[2] * _NODES + node), np.uint32(kinds[3] * _NODES + node), np.uint32(row)
     of_a, of_b = _STRETCH[model[a] >> 11], _STRETCH[model[b] >> 11]
     of_c, of_d = _STRETCH[model[c] >> 11], _STRETCH[model[d] >> 11]
     total = of_a * weights[row, 0] + of_b * weights[row, 1] + of_c * weights[row, 2] + of_d * weights[row, 3]
@@ -142,10 +141,9 @@ def _signed(value):  # type: ignore[no-untyped-def]
 @borrowing
 def _run(levels, near, chances, stream, coder, reading):  # type: ignore[no-untyped-def]
     """Code levels ``[N, C]`` row after row; the coder after them."""
-    n, width = levels.shape
-    for i in range(n):
+    for i in range(len(levels)):
         total = 0
-        for k in range(width):
+        for k in range(levels.shape[1]):
             around, nearest, amount = 0, 0, 0
             for q in range(NEIGHBOURS):
                 j = near[i, q]
@@ -167,21 +165,18 @@ def _run(levels, near, chances, stream, coder, reading):  # type: ignore[no-unty
 @compiled
 def _search(begin, end, cells, block, near):  # type: ignore[no-untyped-def]
     """Fill ``near`` with the nearest earlier rows of the same block, the nearest first."""
-    least = np.zeros(NEIGHBOURS, np.int64)
+    least = np.empty(NEIGHBOURS, np.int64)
     for i in range(begin, end):
-        found = 0
+        least[:] = 1 << 62
+        x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
         for j in range(i - 1, max(i - WINDOW, i // block * block) - 1, -1):
-            distance = 0
-            for axis in range(cells.shape[1]):
-                distance += (cells[i, axis] - cells[j, axis]) ** 2
-            if found == NEIGHBOURS and distance >= least[found - 1]:
-                continue
-            at = min(found, NEIGHBOURS - 1)
-            while at > 0 and least[at - 1] > distance:
-                least[at], near[i, at] = least[at - 1], near[i, at - 1]
-                at -= 1
-            least[at], near[i, at] = distance, j
-            found = min(found + 1, NEIGHBOURS)
+            distance = (cells[j, 0] - x) ** 2 + (cells[j, 1] - y) ** 2 + (cells[j, 2] - z) ** 2
+            if distance < least[NEIGHBOURS - 1]:
+                at = NEIGHBOURS - 1
+                while at > 0 and least[at - 1] > distance:
+                    least[at], near[i, at] = least[at - 1], near[i, at - 1]
+                    at -= 1
+                least[at], near[i, at] = distance, j
 
 
 @borrowing
