@@ -16,7 +16,7 @@ from sundae_ns.core.camera import Camera
 from sundae_ns.core.covariance import rotation_matrices
 from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.core.gaussians import FEATURES, Gaussians, sanitise
-from sundae_ns.core.values import AnyArray, numbers
+from sundae_ns.core.values import AnyArray, numbers, positions
 from sundae_ns.head.head import CompensationHead
 from sundae_ns.io.coordinates import similarity
 from sundae_ns.pruning.floaters import STRENGTH, floater_odds
@@ -41,7 +41,7 @@ def transform(
         scale, translation: factor of all lengths; world units ``[3]``.
 
     Raises:
-        ConfigError: the matrix is no rotation, or mirrors; the scale is not positive.
+        ConfigError, DataError: the matrix is no rotation, or the scale not positive; float32 is too coarse there.
 
     >>> import sundae_ns as sn
     >>> scene = sn.Scene.from_points([[1, 0, 0]], [[0.5, 0.5, 0.5]])
@@ -68,7 +68,7 @@ def transform(
         meta["frame"] = {"transform": stated.tolist(), "scale": size}
     placed = torch.cat([turn, shift[:, None] / scale], dim=1)
     moved = similarity({**scene.gaussians, "means": scene.means.double()}, placed, float(scale))
-    moved["means"] = moved["means"].to(scene.means)
+    moved["means"] = positions(moved["means"], "the moved scene").to(scene.means)
     inverse = torch.cat([scale * placed, torch.eye(4, dtype=torch.float64)[3:]]).inverse()
     sizes = torch.tensor([[scale]] * 3 + [[1.0]], dtype=torch.float64)  # of what a camera sees
 

@@ -41,10 +41,7 @@ def survey(offset):
     return dataclasses.replace(SCENE, meta={"frame": {"transform": rows, "scale": 1.0}})
 
 
-def look_at(*points, **options):
-    return sn.Camera.look_at(*points, **options)
-
-
+look_at = sn.Camera.look_at
 GIVEN = {
     "uint8": (POINTS, (255 * POINTS).round().astype("uint8")),
     "uint16": (POINTS, (65535 * POINTS).round().astype("uint16")),
@@ -110,7 +107,7 @@ REFUSED = {
     "ragged means": (lambda: sn.Scene({**SCENE.gaussians, "means": [[1, 2], [3]]}), "does not fit .*inhomogeneous"),
     "flags": (lambda: sn.Scene.from_points(POINTS > 0.5, POINTS), "points has values of type bool"),
     "shape": (lambda: sn.Scene.from_points(POINTS[:, :2], POINTS), r"\[100, 2\] and \[100, 3\]"),
-    "NaN points": (lambda: sn.Scene.from_points(POINTS * np.nan, POINTS), "some points are NaN"),
+    "NaN points": (lambda: sn.Scene.from_points(np.ma.masked_less(POINTS, 0.1), POINTS), "some points are NaN"),
     "NaN colours": (lambda: sn.Scene.from_points(POINTS, POINTS * np.nan), "colors has values from nan"),
     "a survey": (lambda: sn.Scene.from_points(POINTS + 5e6, POINTS), "points is too far from zero"),
     "degree": (lambda: sn.Scene.from_points(POINTS, POINTS, sh_degree=5), "sh_degree is 5"),
@@ -190,6 +187,7 @@ REFUSED = {
     "mirror": (lambda: sn.transform(SCENE, np.diag([1, 1, -1])), "rotation is no rotation"),
     "no quaternion": (lambda: sn.transform(SCENE, [0, 0, 0, 0]), "rotation is no rotation"),
     "scale": (lambda: sn.transform(SCENE, scale=0), "scale is 0"),
+    "moved far": (lambda: sn.transform(SCENE, translation=(5e6, 0, 0)), "the moved scene is too far from zero"),
     "box": (lambda: sn.crop(SCENE, 0, 1), "a corner of the box is not made of 3 finite numbers"),
 }
 
