@@ -49,8 +49,7 @@ def export(
         beside: another scene, which the page shows as it is beside the first one, by the same camera.
         views: views that the page names, each with a link that its button Copy link gives.
         lod: write levels of detail as streamed SOG (lod-meta.json) into the folder, for PlayCanvas's viewers. Below
-            the full scene are a half, a quarter and a tenth of its Gaussians, each pruned from it and trained on its
-            images; minutes on a GPU.
+            the full scene are a half, a quarter and a tenth of it, pruned and trained on its images; minutes on a GPU.
     """
     wishes.check_wishes()
     suffix, upright = out.suffix.lower(), advanced.upright

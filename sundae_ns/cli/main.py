@@ -61,11 +61,13 @@ def _dispatch(words: Sequence[str]) -> int:
     if name not in COMMANDS:
         near = get_close_matches(name, COMMANDS, n=1)
         raise ConfigError(f"there is no command {name}; {f'use {near[0]}' if near else 'sundae --help lists them'}")
-    try:
-        gettempdir()  # else libraries fail at their import
-    except FileNotFoundError as error:
-        remedy = "make room in /tmp, or set TMPDIR to another folder"
-        raise ConfigError(f"no folder for temporary files can be written; {remedy}") from error
+    needs = {os.getcwd: "the working folder is gone; cd to another"}
+    needs[gettempdir] = "no folder for temporary files can be written; make room in /tmp, or set TMPDIR to another"
+    for place, lack in needs.items():  # else libraries fail at their import
+        try:
+            place()
+        except FileNotFoundError as error:
+            raise ConfigError(lack) from error
     import tyro
 
     if (flag := "--remove-floaters") in options:  # its number may be left out

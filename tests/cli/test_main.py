@@ -39,6 +39,8 @@ def test_no_folder_for_temporary_files(monkeypatch, capsys):
     monkeypatch.setattr(tempfile, "tempdir", None)
     monkeypatch.setattr(tempfile, "_candidate_tempdir_list", list)
     assert "no folder for temporary files can be written; make room" in refusal(capsys, "info", "a.ply")
+    monkeypatch.setattr("os.getcwd", Mock(side_effect=FileNotFoundError))
+    assert "the working folder is gone; cd to another" in refusal(capsys, "info", "a.ply")
 
 
 def test_other_errors_are_not_hidden(monkeypatch):
