@@ -172,13 +172,13 @@ def build_tree(points: Tensor) -> BoxTree:
     n = len(points)
     depth = max(0, (n // LEAF).bit_length() - 1)
     coordinates = points.detach().T.contiguous()
-    place = torch.arange(n, device=points.device)
-    order = place.to(torch.int32)
+    position = torch.arange(n, device=points.device)
+    order = position.to(torch.int32)
     ranks = torch.stack([_ranks(axis) for axis in coordinates])
     for level in range(depth):
         low, high = _bounds(coordinates, level)
         widest = (high - low).argmax(dim=0)
-        segment = ((place + 1) * 2**level - 1) // n
+        segment = ((position + 1) * 2**level - 1) // n
         rank = ranks.gather(0, widest[segment][None]).squeeze(0)
         sorting = torch.sort(segment.mul_(n).add_(rank)).indices
         coordinates, ranks, order = coordinates[:, sorting], ranks[:, sorting], order[sorting]
@@ -213,8 +213,8 @@ def _segments(rows: Tensor, level: int) -> Tensor:
     n, count = rows.shape[1], 2**level
     starts = torch.arange(count + 1, device=rows.device) * n // count
     most = -(-n // count)
-    places = starts[:-1, None] + torch.arange(most, device=rows.device)
-    return rows[:, torch.minimum(places, starts[1:, None] - 1)]
+    positions = starts[:-1, None] + torch.arange(most, device=rows.device)
+    return rows[:, torch.minimum(positions, starts[1:, None] - 1)]
 
 
 def _bounds(coordinates: Tensor, level: int) -> tuple[Tensor, Tensor]:

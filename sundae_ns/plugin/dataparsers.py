@@ -380,8 +380,10 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
     usual = distances.median()
     cloud = centres[:0] if points is None else points.cpu()
     far = torch.from_numpy(stray_cameras(centres.double().numpy(), lambda: cloud.double().numpy()))
-    if not far.any() and usual > 0 and (far := distances > 20 * usual).any() and len(cloud):
-        far &= distances > STRAY * float((cloud.double() - middle).norm(dim=1).median())
+    if not far.any() and usual > 0:
+        far = distances > 20 * usual
+        if len(cloud):
+            far &= distances > STRAY * float((cloud.double() - middle).norm(dim=1).median())
     if far.any():
         times = f"{float(distances[far][0] / usual):,.0f} times as far away as most"
         which = f"{next(compress(names, far)).name} is {times if usual > 0 else 'far from all others'}"

@@ -221,7 +221,8 @@ class Distillation:
 
     def result(self) -> Scene:
         """The scene as it is now, in the coordinates of the full one."""
-        return dataclasses.replace(scene := self.scene(), gaussians=resized(scene.gaussians, self._size))
+        scene = self.scene()
+        return dataclasses.replace(scene, gaussians=resized(scene.gaussians, self._size))
 
     def save(self, path: Path) -> None:
         """Write what a resumed training needs, atomically."""

@@ -38,7 +38,6 @@ from sundae_ns.core.gaussians import FEATURES, Gaussians
 from sundae_ns.core.surgery import change_parameter, per_gaussian
 from sundae_ns.scene.render import GaussianSource, RenderSettings, colors_from, may_be_seen
 from sundae_ns.train.densification import COUNTED, start_counting
-from sundae_ns.train.exposure import ExposureCompensation
 from sundae_ns.train.state import Callback, TrainingState
 
 HEAD = "compensation"  # Name of the head's optimizer: every rank holds a copy of the head
@@ -118,18 +117,18 @@ class ShardedSource(GaussianSource):
         """Find the rows to send; centres of all cameras ``[R, 3]``, and the camera of each row ``[S]``."""
         means, ranks = self.gaussians["means"], dist.get_world_size()
         size = means.new_tensor([camera.width, camera.height, len(means)])
-        own = torch.cat([camera.viewmat.flatten(), camera.K.flatten(), size])
-        cameras = own.new_empty(ranks * len(own))
-        dist.all_gather_into_tensor(cameras, own)
+        packed = torch.cat([camera.viewmat.flatten(), camera.K.flatten(), size])
+        cameras = packed.new_empty(ranks * len(packed))
+        dist.all_gather_into_tensor(cameras, packed)
         viewmats, Ks, sizes = cameras.view(ranks, -1).split([16, 9, 3], dim=1)
         viewmats = viewmats.reshape(-1, 4, 4)
-        seen = may_be_seen(means, self.gaussians["scales"], viewmats, Ks.reshape(-1, 3, 3), sizes[:, :2])
-        sent = seen.sum(dim=1)
+        visible = may_be_seen(means, self.gaussians["scales"], viewmats, Ks.reshape(-1, 3, 3), sizes[:, :2])
+        sent = visible.sum(dim=1)
         received = torch.empty_like(sent)
         dist.all_to_all_single(received, sent)
         numbers = torch.stack([sent, received, sizes[:, 2].long()])
         self._sent, self._received, self.sizes = numbers.tolist()  # waits for the GPU, once a step
-        receiver, self._rows = torch.nonzero_static(seen, size=sum(self._sent)).unbind(dim=1)
+        receiver, self._rows = torch.nonzero_static(visible, size=sum(self._sent)).unbind(dim=1)
         return torch.stack([camera._replace(viewmat=viewmat).center for viewmat in viewmats]), receiver
 
     @torch.no_grad()
@@ -207,9 +206,7 @@ class Ranks:
             return
         self._model, self._optimizers, self.sharded = model, optimizers, ShardedSource(model.state.gaussians)
         datamanager.rank = self.rank
-        for callback in model.train_callbacks:
-            if isinstance(callback, ExposureCompensation):
-                callback.total = _summed
+        model.exposure_compensation.total = _summed
         self._scatter()
 
     def agreed(self, number: int, batch: int) -> int:

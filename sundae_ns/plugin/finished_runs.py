@@ -101,7 +101,7 @@ def load_model(
     """
     scene = load(path) if kind_of(path) == "packed" or kind_of_gaussians(path) is not None else None
     if scene is not None and like is not None and "capture" not in scene.meta:
-        return _placed_in(like, path, scene)
+        return _in_views_of(like, path, scene)
     if scene is not None:
         opened = _open_file(path, scene, data or (None if like is None else like.capture))
     else:
@@ -116,17 +116,17 @@ def load_model(
         for camera, batch in opened.datamanager.fixed_indices_eval_dataloader:
             opened.cameras.append(camera.to(model.device))
             opened.truths.append(model.truth(batch, {"background": model._get_background_color()}))
-    return opened if scene is None or "capture" in scene.meta else _placed_in(opened, path, scene)
+    return opened if scene is None or "capture" in scene.meta else _in_views_of(opened, path, scene)
 
 
-def _placed_in(like: Opened, path: Path, scene: Scene) -> Opened:
+def _in_views_of(like: Opened, path: Path, scene: Scene) -> Opened:
     """A file in the test views of another scene; of the model's and the capture's coordinates, those that fit."""
-    device, some = like.model.device, slice(None, None, len(like.cameras) // 4 + 1)
+    device, subset = like.model.device, slice(None, None, len(like.cameras) // 4 + 1)
     scene = dataclasses.replace(scene, background_color=like.model.config.background_color)
     if not scene.in_model_frame:  # which few formats state
         matrix, scale = like.datamanager.train_dataset.metadata[DATASET_FRAME]
         moved = transform(scene, matrix[:, :3], scale, scale * matrix[:, 3])
-        views = like.truths[some], [like.model.camera_of(camera) for camera in like.cameras[some]]
+        views = like.truths[subset], [like.model.camera_of(camera) for camera in like.cameras[subset]]
         scene = max((scene, moved), key=lambda each: measure(each.to(device), *views).psnr)
     facts: Any = {"source": path, "variant": path.name, "packed_bytes": path.stat().st_size, "method": "", "steps": 0}
     facts |= dict.fromkeys(("kept", "seed", "prune_s", "pipeline"))
@@ -230,13 +230,13 @@ def model_of(scene: Scene) -> SundaeModel:
 
 def put_scene(model: SundaeModel, scene: Scene) -> None:
     """Load a scene into a model in place; the model has its SH degree or more, and a head of its kind."""
-    place(model, scene.gaussians)
+    put_gaussians(model, scene.gaussians)
     if model.head is not None and scene.head is not None:
         model.head.load_state_dict(scene.head.state_dict())
     model.state.trained_focal = scene.trained_focal
 
 
-def place(model: SundaeModel, gaussians: Mapping[str, Tensor]) -> None:
+def put_gaussians(model: SundaeModel, gaussians: Mapping[str, Tensor]) -> None:
     """Load Gaussians into a model in place; parameters and coefficients that they lack become 0."""
     for name, value in model.gauss_params.items():
         new = value.data.new_zeros(len(gaussians["means"]), *value.shape[1:])
@@ -300,7 +300,8 @@ def datamanager_of(scene: Scene, data: Path) -> SundaeDatamanagerConfig:
         parser, scale = stated_capture(stated)
         shape = {"camera_res_scale_factor": scale, "robust_frame": stated.get("robust_frame") is True}
     else:
-        kind, *words = ["nerfstudio-data"] if (layout := posed_layout(data)) is None else layout.words
+        layout = posed_layout(data)
+        kind, *words = ["nerfstudio-data"] if layout is None else layout.words
         parser = tyro.cli(_PARSERS[kind], args=words)
     check_capture(parser, data, ("train", "test"))
     return SundaeDatamanagerConfig(dataparser=parser, data=data.resolve(), cache_images_type="uint8", **shape)

@@ -295,10 +295,10 @@ class SundaeModel(SplatfactoModel):
         config, state = self.config, self.state
         rising = config.num_downscales - step // config.resolution_schedule if config.warm_start is None else 0
         # Densification takes its statistics from whole images.
-        parts = state.head_enabled and not state.densifying
-        pixels = config.head.max_train_pixels if parts else 0
+        cropped = state.head_enabled and not state.densifying
+        pixels = config.head.max_train_pixels if cropped else 0
         # Mirrored images help in the long run only.
-        mirror = parts and not state.provisional and config.head.mode != "features"
+        mirror = cropped and not state.provisional and config.head.mode != "features"
         return StepResolution(step, int(2 ** max(rising, 0)), pixels, mirror)
 
     def get_training_callbacks(
@@ -453,7 +453,8 @@ class NerfstudioRun:
         self.state.optimizers, self.state.schedulers = self._optimizers.optimizers, self._optimizers.schedulers
         if self.folder is not None:
             resumed = self._trainer.config.load_dir or self._trainer.config.load_checkpoint
-            if resumed and (config := find_config(resumed)) and config.parent.resolve() != self.folder.resolve():
+            config = find_config(resumed) if resumed else None
+            if config is not None and config.parent.resolve() != self.folder.resolve():
                 take_records(config.parent, self.folder, self.state.schedule_step)
         for callback in self.model.train_callbacks:
             callback.before_training(self)

@@ -28,7 +28,7 @@ from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.io.pack.codecs import Codecs, estimated_bits
 from sundae_ns.io.pack.config import COARSEST, FINEST, PackConfig, scaled
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
-from sundae_ns.plugin.finished_runs import load_model, place
+from sundae_ns.plugin.finished_runs import load_model, put_gaussians
 from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.plugin.optimizer_configs import optimise, rate_factor
 from sundae_ns.rasterize.gsplat_kernels import Capacity
@@ -72,7 +72,7 @@ def finetune(
     pipeline, model = opened.pipeline, opened.model
     if model.state.densifying:
         raise CheckpointError(f"{run} was saved during densification; train it to its end, or leave out the fine-tune")
-    place(model, scene.gaussians)
+    put_gaussians(model, scene.gaussians)
     # Rounded quaternions have length 1, and gradients refer to them.
     model.gauss_params["quats"].data = torch.nn.functional.normalize(model.gauss_params["quats"].data)
     for name, value in model.gauss_params.items():
@@ -136,8 +136,8 @@ class RoundedTraining:
 
     def _run(self, inputs: StepInputs, settings: RenderSettings, capacity: Capacity | None) -> StepResult:
         """One step; all of its work is recorded."""
-        parts = self._codecs.gaussians, self.head
-        gaussians, head = ({name: self.exact[name] for name in names} for names in parts)
+        gaussians = {name: self.exact[name] for name in self._codecs.gaussians}
+        head = {name: self.exact[name] for name in self.head}
         with torch.no_grad():  # rounded in place, because recorded graphs read the parameters there
             rounded = self._codecs.rounded(gaussians) | self._codecs.rounded_head(head)
             for name, value in rounded.items():
@@ -188,7 +188,7 @@ class Judge:
 
     def quality(self, scene: PackedScene, codecs: Codecs) -> Quality:
         """Quality of a pack."""
-        place(self._model, codecs.rounded(scene.gaussians))
+        put_gaussians(self._model, codecs.rounded(scene.gaussians))
         if self._model.head is not None and scene.head:
             self._model.head.load_state_dict(codecs.rounded_head(scene.head))
         return self._quality()

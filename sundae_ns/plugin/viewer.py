@@ -33,9 +33,6 @@ _log = logging.getLogger(__name__)
 
 RuleName = Literal["as configured", "band: high", "band: low", "band: both"]
 
-ContributionOf = Callable[[Any, int | None], Tensor]
-"""Contribution of the Gaussians ``[N]``, given nerfstudio's datamanager and the number that a prune will keep."""
-
 
 def in_viewer() -> bool:
     """Whether the calling thread renders for a browser.
@@ -75,15 +72,16 @@ class Visible(NamedTuple):
 class ViewerControls(torch.nn.Module):
     """The controls, and what the preview has computed of the Gaussians of a state by the ``configured`` rule.
 
-    A module without parameters, because nerfstudio looks for viewer elements in modules only. ``curve`` gives that by
-    which trials have chosen the number of Gaussians; empty without them.
+    A module without parameters, because nerfstudio looks for viewer elements in modules only. ``contribute`` returns
+    the contribution of the Gaussians ``[N]``, given nerfstudio's datamanager and the number that a prune will keep;
+    ``curve`` the curve by which trials have chosen the number of Gaussians, empty without them.
     """
 
     def __init__(
         self,
         state: TrainingState,
         configured: PruneRule,
-        contribute: ContributionOf,
+        contribute: Callable[[Any, int | None], Tensor],
         curve: Callable[[], Sequence[CurvePoint]] = list,
     ) -> None:
         super().__init__()

@@ -157,14 +157,14 @@ def _cheapest_of_both(pairs: tuple[Tensor, ...], cost: Tensor, n: int) -> Tensor
     least = cost.new_full((n,), torch.inf)
     for ends in pairs:
         least.scatter_reduce_(0, ends, cost, "amin")
-    found = (cost <= torch.minimum(*(least.index_select(0, ends) for ends in pairs))).nonzero().squeeze(1)
-    found = found[torch.sort(cost[found], stable=True).indices]
+    cheapest = (cost <= torch.minimum(*(least.index_select(0, ends) for ends in pairs))).nonzero().squeeze(1)
+    cheapest = cheapest[torch.sort(cost[cheapest], stable=True).indices]
     # Pairs of exactly equal cost may share a group: the earlier one has it.
-    place = torch.arange(len(found), device=cost.device)
-    earliest = torch.full((n,), len(found), device=cost.device)
+    rank = torch.arange(len(cheapest), device=cost.device)
+    earliest = torch.full((n,), len(cheapest), device=cost.device)
     for ends in pairs:
-        earliest.scatter_reduce_(0, ends[found], place, "amin")
-    return found[(earliest[pairs[0][found]] == place) & (earliest[pairs[1][found]] == place)]
+        earliest.scatter_reduce_(0, ends[cheapest], rank, "amin")
+    return cheapest[(earliest[pairs[0][cheapest]] == rank) & (earliest[pairs[1][cheapest]] == rank)]
 
 
 @torch.no_grad()
@@ -183,8 +183,8 @@ def voronoi_labels(graph: NeighborGraph, mask: Tensor) -> Tensor:
     distance = torch.where(mask, 0.0, torch.inf).double()
     changed = mask
     for _ in range(MOST_HOPS):
-        found = [_nearer(graph, rows, changed, distance) for rows in chunks(graph.N, ROWS)]
-        rows, through, reached = (torch.cat(parts) for parts in zip(*found, strict=True))
+        relaxed = [_nearer(graph, rows, changed, distance) for rows in chunks(graph.N, ROWS)]
+        rows, through, reached = (torch.cat(values) for values in zip(*relaxed, strict=True))
         if not len(rows):
             break
         label[rows] = label[through]

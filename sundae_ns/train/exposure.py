@@ -83,7 +83,7 @@ class ExposureCompensation(Callback):
                 log.warning(f"exposure-compensation is off: {len(indices)} {few}")
             return
         self._state, self._rows = run.state, np.asarray(indices)
-        positions = places([camera for camera, _ in run.training_views()]).cpu()
+        positions = view_points([camera for camera, _ in run.training_views()]).cpu()
         self._smoother = Smoother(build_graph(positions, num_neighbors=NEIGHBORS), SMOOTHING)
         if run.images_per_step > 1:  # of the first rank alone
             self._sums.zero_()
@@ -156,7 +156,7 @@ def _index(batch: Mapping[str, Any]) -> int | None:
     return None if index is None or batch["image"].shape[-1] == 4 else int(index)
 
 
-def places(cameras: Sequence[Camera]) -> Tensor:
+def view_points(cameras: Sequence[Camera]) -> Tensor:
     """One point for each camera ``[N, 3]``; cameras with similar views have points close together.
 
     The point lies behind the camera, at the root mean square distance of the cameras to their middle. So two cameras at

@@ -303,7 +303,7 @@ class RecordedStep:
         groups = [(name, optimizer, group) for name, optimizer in optimizers for group in optimizer.param_groups]
         moments = [(optimizer.state, value) for _, optimizer, group in groups for value in group["params"]]
         tensors: list[tuple[Mapping[Any, Any], Any, Any]] = [(mapping, key, mapping[key]) for mapping, key in moments]
-        addresses = tuple(own[name].data_ptr() for _, _, own in tensors for name in (*MOMENTS, "step"))
+        addresses = tuple(adam[name].data_ptr() for _, _, adam in tensors for name in (*MOMENTS, "step"))
         tensors += [(state.gaussians, name, state.gaussians[name]) for name in trained]
         running = state.densification
         tensors += [(running, name, value) for name, value in running.items() if isinstance(value, Tensor)]
@@ -318,12 +318,11 @@ class RecordedStep:
         trained = {name: tensors[name] for name in held.trained}
         # With parameters that have no values, such as the features of a field without a head.
         empty = {name: value for name, value in state.gaussians.items() if name not in trained and value.numel() == 0}
-        gaussians = Gaussians(trained, state.gaussians.encoding)
         source = GaussianSource(Gaussians({**empty, **trained}, state.gaussians.encoding))
         loss, splatted, result = training_step(source, state, self._losses, inputs, settings)
         network = [] if head is None else list(head.parameters())
         counting, centers = state.densifying and "grad2d" in tensors, splatted.info["means2d"]
-        wanted = [*gaussians.values(), *network, *([centers] if counting else [])]
+        wanted = [*trained.values(), *network, *([centers] if counting else [])]
         grads = torch.autograd.grad(loss, wanted, allow_unused=True)
         with torch.no_grad():
             overflow = self._recordings.overflow(capacity)
@@ -332,7 +331,7 @@ class RecordedStep:
                 radii = radii if overflow is None else radii * (overflow == 0)
                 count_view(tensors, of_centers[0], radii[0], camera.width, camera.height)
             assert inputs.rates is not None
-            updates = self._updates(held, dict(zip([*gaussians.values(), *network], grads, strict=False)))
+            updates = self._updates(held, dict(zip([*trained.values(), *network], grads, strict=False)))
             adam_step(updates, inputs.rates, overflow)
         return result
 

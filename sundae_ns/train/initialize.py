@@ -108,9 +108,7 @@ def _warm_gaussians(options: Any, source: Path, frame: Frame | None) -> dict[str
         raise CheckpointError(f"{turned}; if it had that, give --pipeline.model.warm-start-frame capture")
     if not in_model_frame:
         if frame is None:
-            unknown = (
-                "the warm start is in the capture's coordinates, and only sundae's datamanager knows their transform"
-            )
+            unknown = "the warm start is in the capture's coordinates, and only sundae's datamanager can convert them"
             raise CheckpointError(f"{unknown}; train with it, or give --pipeline.model.warm-start-frame model")
         params = similarity(params, *frame)
         params["means"] = params["means"].float()  # survey coordinates are float64 until here

@@ -94,10 +94,10 @@ class Sweep:
             ends = 1 / (high * float(facing[steep].max())), 1 / (low * float(facing[steep].min()))
             planes = _number_of_planes(photo, others, normal, ends)
             s = torch.linspace(*ends, planes, dtype=facing.dtype, device=facing.device)
-            score, place = _peaks(correlations(facing, s))
+            score, plane = _peaks(correlations(facing, s))
             score = torch.where(steep, score, -1.0)
-            found = 1 / (facing * (s[0] + place * (s[1] - s[0]))).clamp_min(1e-12)
-            depth, best = torch.where(score > best, found, depth), torch.maximum(score, best)
+            candidate = 1 / (facing * (s[0] + plane * (s[1] - s[0]))).clamp_min(1e-12)
+            depth, best = torch.where(score > best, candidate, depth), torch.maximum(score, best)
         self._depths[index] = torch.where((best > CORRELATION) & photo.usable, depth, 0.0)
         return self._depths[index]
 
@@ -108,16 +108,16 @@ class Sweep:
         """
         empty = self._sparse.new_zeros(0, 3)
         every = max(1, sum(int((depth > 0).sum()) for depth in self._depths) // max(1, _LOOKED_AT * wanted))
-        places, colours = zip((empty, empty), *(self._agreeing(index, every) for index in range(len(self.photos))))
-        return torch.cat(places), torch.cat(colours)
+        positions, colours = zip((empty, empty), *(self._agreeing(index, every) for index in range(len(self.photos))))
+        return torch.cat(positions), torch.cat(colours)
 
     def _limits(self, camera: Camera) -> tuple[float, float] | None:
         """Nearest and farthest depth to look at; None where too few sparse points are seen."""
         x, y, z = _project(camera, self._sparse)
-        seen = z[_in_view(camera, x, y, z)].sort().values
-        if len(seen) < SEEN:
+        depths = z[_in_view(camera, x, y, z)].sort().values
+        if len(depths) < SEEN:
             return None
-        ends = seen[[int(0.02 * (len(seen) - 1)), int(0.98 * (len(seen) - 1))]].tolist()
+        ends = depths[[int(0.02 * (len(depths) - 1)), int(0.98 * (len(depths) - 1))]].tolist()
         return NEARER * ends[0], FARTHER * ends[1]
 
     def _agreeing(self, index: int, every: int) -> tuple[Tensor, Tensor]:
@@ -132,10 +132,11 @@ class Sweep:
             there_x, there_y, z = _project(other.camera, points)
             column = there_x.nan_to_num().clamp(0, other.camera.width - 1).long()
             row = there_y.nan_to_num().clamp(0, other.camera.height - 1).long()
-            found = depths[row, column]
-            theirs = _to_world(other, other.rays(row, column) * found[:, None])
+            other_depth = depths[row, column]
+            theirs = _to_world(other, other.rays(row, column) * other_depth[:, None])
             back_x, back_y, _ = _project(photo.camera, theirs)
-            agrees = _in_view(other.camera, there_x, there_y, z) & (found > 0) & ((found - z).abs() < LARGEST_ERROR * z)
+            agrees = _in_view(other.camera, there_x, there_y, z) & (other_depth > 0)
+            agrees &= (other_depth - z).abs() < LARGEST_ERROR * z
             agrees &= torch.hypot(back_x - x, back_y - y) < LARGEST_SHIFT
             total += torch.where(agrees[:, None], theirs, 0.0)
             count += agrees
@@ -187,14 +188,14 @@ def _neighbors(photos: Sequence[_Reduced], sparse: Tensor) -> list[tuple[list[in
     """
     if len(photos) < 2 or not len(sparse):
         return [([], []) for _ in photos]
-    seen = torch.stack([_in_view(photo.camera, *_project(photo.camera, sparse)) for photo in photos])
+    visible = torch.stack([_in_view(photo.camera, *_project(photo.camera, sparse)) for photo in photos])
     directions = torch.stack([normalize(sparse - photo.pose[:3, 3], dim=-1) for photo in photos])
     neighbors = []
     for i in range(len(photos)):
         angles = torch.rad2deg((directions * directions[i]).sum(dim=-1).clamp(-1, 1).acos())
         # Near directions tell little about depths; from far ones places look different.
         weights = angles / (angles + 4) * torch.exp(-((angles / 36) ** 2))
-        shared = (weights * (seen & seen[i])).sum(dim=1)
+        shared = (weights * (visible & visible[i])).sum(dim=1)
         shared[i] = -1
         order = torch.argsort(shared, descending=True, stable=True)[: len(photos) - 1].tolist()
         neighbors.append(([j for j in order[:NEIGHBORS] if shared[j] > 0], order[:CONFIRMING]))
@@ -219,16 +220,16 @@ def _correlations(
     """The function of :func:`.fused_correlations` for a view, its rays ``[H, W, 3]`` and its neighbours."""
     patches = _patches(photo.grey)
     # X' = R X + t with s normal . X = 1: the ray r projects to K (R r + s (normal . r) t).
-    ways = [other.camera.K @ (other.camera.viewmat @ photo.pose)[:3] for other in others]
+    warps = [other.camera.K @ (other.camera.viewmat @ photo.pose)[:3] for other in others]
     slower = "a plane sweep runs as hundreds of kernels a direction"
     kernels = kernels_where_possible(sweep_kernels, photo.grey.device, slower)
     if kernels:
-        maps = torch.stack([torch.cat([way[:, :3] @ photo.unproject, way[:, 3:]], dim=1) for way in ways])
+        maps = torch.stack([torch.cat([warp[:, :3] @ photo.unproject, warp[:, 3:]], dim=1) for warp in warps])
         images = [other.grey[0, 0] for other in others]
         return fused_correlations(kernels, patches, images, maps, inverses, LEAST_VARIANCE)
-    starts = [rays @ way[:, :3].T for way in ways]
+    starts = [rays @ warp[:, :3].T for warp in warps]
     return lambda facing, s: torch.cat(
-        [_scores(patches, others, starts, ways, facing * part[:, None, None], inverses) for part in s.split(_BATCH)]
+        [_scores(patches, others, starts, warps, facing * batch[:, None, None], inverses) for batch in s.split(_BATCH)]
     )
 
 
@@ -236,21 +237,21 @@ def _scores(
     patches: Patches,
     others: Sequence[_Reduced],
     starts: Sequence[Tensor],
-    ways: Sequence[Tensor],
+    warps: Sequence[Tensor],
     inverse: Tensor,
     inverses: tuple[float, float],
 ) -> Tensor:
     """What the kernel computes, by PyTorch's operations: scores ``[S, H, W]`` for inverse depths ``[S, H, W]``."""
     inside = (inverse >= inverses[0]) & (inverse <= inverses[1])
     scores = []
-    for other, start, way in zip(others, starts, ways):
-        x, y, z = (start[..., i] + inverse * way[i, 3] for i in range(3))
+    for other, start, warp in zip(others, starts, warps):
+        x, y, z = (start[..., i] + inverse * warp[i, 3] for i in range(3))
         sides = z.new_tensor([other.camera.width, other.camera.height])
         grid = 2 * torch.stack([x, y], dim=-1) / (z.clamp_min(1e-6)[..., None] * sides) - 1
         valid = inside & (z > 1e-6) & (grid.abs() < 1).all(dim=-1)
         grey = other.grey.expand(len(inverse), -1, -1, -1)
-        seen = grid_sample(grey, grid, padding_mode="border", align_corners=False)
-        moments = _box(torch.cat([seen, seen * seen, seen * patches.grey], dim=1)) / patches.size
+        warped = grid_sample(grey, grid, padding_mode="border", align_corners=False)
+        moments = _box(torch.cat([warped, warped * warped, warped * patches.grey], dim=1)) / patches.size
         average, square, product = moments.unbind(dim=1)
         variance = (square - average * average).clamp_min(LEAST_VARIANCE)
         score = (product - average * patches.mean) / (patches.deviation * variance.sqrt())
@@ -259,7 +260,7 @@ def _scores(
 
 
 def _peaks(scores: Tensor) -> tuple[Tensor, Tensor]:
-    """Highest score of each pixel and its place among the planes, by a parabola through three of them: ``[H, W]``."""
+    """Highest score of each pixel and the index of its plane, by a parabola through three of them: ``[H, W]``."""
     score, k = scores.max(dim=0)
     inner = k.clamp(1, len(scores) - 2)
     before, at, after = (scores.gather(0, inner[None] + i)[0] for i in (-1, 0, 1))

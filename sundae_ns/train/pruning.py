@@ -340,8 +340,8 @@ class FloaterRemoval(Callback):
             return
         self._done = True
         assert self._points is not None
-        if not (eyes := [camera.center for camera, _ in run.training_views()]):
-            return
+        eyes = torch.stack([camera.center for camera, _ in run.training_views()])
         pruner = Pruner(state.gaussians, state.optimizers, [state.densification])
-        if removed := pruner.drop(near_cameras(pruner.params["means"], torch.stack(eyes), self._points), at_most=MOST):
+        removed = pruner.drop(near_cameras(pruner.params["means"], eyes, self._points), at_most=MOST)
+        if removed:
             log.info(f"step {state.step}: removed {removed:,} floaters right in front of a camera")

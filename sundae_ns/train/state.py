@@ -106,9 +106,10 @@ class TrainingState:
         self, backend: Backend, *, antialiased: bool, training: bool = False, absgrad: bool = False
     ) -> RenderSettings:
         """Render settings at this step; ``absgrad`` says whether densification reads absolute gradients."""
+        interval = self.sh_degree_interval
         return RenderSettings(
             backend=backend,
-            active_sh_degree=MAX_SH_DEGREE if (n := self.sh_degree_interval) is None else self.step // max(n, 1),
+            active_sh_degree=MAX_SH_DEGREE if interval is None else self.step // max(interval, 1),
             antialiased=antialiased,
             training=training,
             absgrad=absgrad and training and self.densifying,

@@ -233,11 +233,11 @@ class Trials(Callback):
 
     def before_training(self, run: TrainingRun) -> None:
         """Hold views out; decide at once where trials cannot."""
-        progress, state, num_views = self.progress, run.state, len(run.view_indices())
-        several = run.images_per_step > 1
+        progress, state, indices = self.progress, run.state, run.view_indices()
+        num_views, several = len(indices), run.images_per_step > 1
         # A warm start skips the steps before the prune.
         progress.steps = progress.steps or (run.schedule_length or 0) + state.offset
-        self._window, indices = max(round(COUNT_SHARE * progress.steps), 1), run.view_indices()
+        self._window = max(round(COUNT_SHARE * progress.steps), 1)
         self._folds, self._length = choice.plan_heads(indices, progress.steps)
         self._judges = choice.spread_cameras(indices, min(choice.MOST_HELD_OUT, num_views // choice.HELD_OUT_EVERY), 0)
         state.pruning[VIEWS] = num_views

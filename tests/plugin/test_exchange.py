@@ -142,9 +142,9 @@ class Halving(Callback):
 def shared(rank, state):
     ranks, optimizers = Ranks(rank, RANKS), SimpleNamespace(parameters={})
     model = SimpleNamespace(state=state, source=GaussianSource(state.gaussians), device="cpu")
-    model.train_callbacks = [ExposureCompensation(3, "on")]
+    model.exposure_compensation = ExposureCompensation(3, "on")
     ranks.share(model, SimpleNamespace(rank=0), optimizers)
-    assert model.train_callbacks[0].total is _summed
+    assert model.exposure_compensation.total is _summed
     assert all(held[0] is state.gaussians[name] for name, held in optimizers.parameters.items())
     return ranks, model
 
