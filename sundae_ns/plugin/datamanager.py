@@ -36,11 +36,6 @@ DATASET_FRAME = "sundae_dataset_frame"
 """Metadata key of the training set: transform ``[3, 4]`` and scale from the capture's coordinates to the model's."""
 
 
-def view_index(camera: Cameras) -> int | None:
-    """Index of the training view that :meth:`SundaeDatamanager.next_train` gave; None for other cameras."""
-    return (camera.metadata or {}).get("cam_idx")
-
-
 def _shows_something(batch: Mapping[str, Tensor]) -> bool:
     """Whether a pixel of an image is neither fully transparent nor masked."""
     image, mask = batch["image"], batch.get("mask")

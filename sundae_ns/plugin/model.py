@@ -31,7 +31,7 @@ from sundae_ns.head.head import CompensationHead, HeadConfig, bytes_of_module
 from sundae_ns.io import checkpoint
 from sundae_ns.io.config_file import find_config
 from sundae_ns.io.run_folder import take_records
-from sundae_ns.plugin.datamanager import DATASET_FRAME, SundaeDatamanager, view_index
+from sundae_ns.plugin.datamanager import DATASET_FRAME, SundaeDatamanager
 from sundae_ns.plugin.dataparsers import camera_of, check_projection
 from sundae_ns.plugin.distributed import Ranks
 from sundae_ns.plugin.viewer import ViewerControls, in_viewer
@@ -232,8 +232,10 @@ class SundaeModel(SplatfactoModel):
             return self._training_outputs(camera) if self.training else self._shown_outputs(camera)
 
     def _training_outputs(self, ns_camera: Cameras) -> MutableMapping[str, Any]:
-        background, (camera, crop) = self._get_background_color(), self._training_camera(ns_camera)
-        settings, depth = self.render_settings(training=True), self.config.output_depth_during_training
+        background = self._get_background_color()
+        camera, crop = self._training_camera(ns_camera)
+        settings = self.render_settings(training=True)
+        depth = self.config.output_depth_during_training
         images, splatted = render_view(self.source, camera, background, settings, depth=depth)
         self.state.info = splatted.info
         for callback in self.train_callbacks:
@@ -275,15 +277,17 @@ class SundaeModel(SplatfactoModel):
     def _training_camera(self, ns_camera: Cameras) -> tuple[Camera, Crop | None]:
         """The part of a training camera that a step shows. Views are kept: copying one to a GPU waits for it."""
         at = self.resolution(self.step)
-        key = view_index(ns_camera), at.downscale
+        index = (ns_camera.metadata or {}).get("cam_idx")  # the datamanager's, of a training view
+        key = index, at.downscale
         camera = self._cameras.get(key) or self.camera_of(ns_camera, at.downscale)
-        if key[0] is not None and self.camera_optimizer.config.mode == "off":
+        if index is not None and self.camera_optimizer.config.mode == "off":
             self._cameras[key] = camera
         return training_part(self.state, camera, at)
 
     def step_inputs(self, ns_camera: Cameras, batch: dict[str, Any]) -> StepInputs:
         """What a step outside of nerfstudio's loop trains on, from a camera of shape ``(1,)`` and its batch."""
-        background, (camera, crop) = self._get_background_color(), self._training_camera(ns_camera)
+        background = self._get_background_color()
+        camera, crop = self._training_camera(ns_camera)
         target = self.target(batch, {"background": background, "window": crop})
         return StepInputs(camera, target, self.mask(batch, crop), background, crop)
 
