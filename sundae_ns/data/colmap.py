@@ -169,7 +169,7 @@ def _images(content: bytes, text: bool) -> Iterator[tuple[int, tuple[float, ...]
 
 def _rows(content: bytes, *, images: bool = False) -> list[list[str]]:
     """Words of the entries of a text. An image has a second line, and a name that may have spaces."""
-    lines = map(str.strip, re.split(r"\r\n|\r|\n", content.decode("utf-8")))
+    lines = map(str.strip, re.split(r"\r\n|\r|\n", content.decode("utf-8-sig")))
     rows = []
     for line in lines:
         if line and not line.startswith("#"):

@@ -23,8 +23,7 @@ _OPTIONS = {
     "protocol_whitelist": "file",
 }
 _CONVERT = "convert it to .mp4 (H.264)"
-# By their numbers in ITU-T H.273: matrices of BT.709, FCC, BT.601 (twice), SMPTE 240M, BT.2020; those of RGB or unknown
-# ones; transfers that no player shows as they are.
+# Numbers of ITU-T H.273: matrices of BT.709, FCC, BT.601 (twice), 240M, BT.2020; of RGB or unknown; transfers refused.
 _MATRICES, _UNSTATED = (1, 4, 5, 6, 7, 9), (0, 2, 3)
 _NOT_SHOWN = {8: "linear", 9: "logarithmic", 10: "logarithmic", 17: "cinema (SMPTE 428)"}
 _DOLBY = ("dvh1", "dvhe", "dva1", "dvav")  # Without a stated transfer (profile 5) their colours are of no standard
@@ -63,8 +62,7 @@ def image_of(frame: Any, path: Path, aspect: float = 1.0) -> Image.Image:
     """A frame (``av.VideoFrame``) as an upright image in sRGB; ``DataError`` if it states colours not known here.
 
     Its own matrix and range count; without a matrix BT.709 from 1280 x 577 on and BT.601 below, as in players. A high
-    dynamic range is rolled off; other transfers are shown as they are, and so are wide gamuts. Pixels whose width is
-    ``aspect`` times their height become square.
+    dynamic range is rolled off; other transfers and gamuts stay. Pixels ``aspect`` times as wide as high become square.
     """
     matrix, transfer = int(frame.colorspace), int(frame.color_trc)
     if matrix in _UNSTATED:

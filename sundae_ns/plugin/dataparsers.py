@@ -24,7 +24,6 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, Datapa
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from nerfstudio.data.utils import colmap_parsing_utils
-from nerfstudio.utils.io import load_from_json
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -232,7 +231,7 @@ class LightNerfstudioParser(_Placed, Nerfstudio):
     def _read(self, path: Path) -> dict[str, Any]:
         """The file as nerfstudio's method understands it: intrinsics in each frame, and lenses apart."""
         folder = path.parent
-        meta = with_focal_lengths(load_from_json(path), folder)
+        meta = with_focal_lengths(read_json(path), folder)
         frames = meta["frames"]
         for frame in frames:
             name = self._get_fname(Path(frame["file_path"]), folder)

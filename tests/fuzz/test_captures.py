@@ -27,10 +27,10 @@ from sundae_ns.core.errors import DataError
 from sundae_ns.data.colmap import check_colmap
 
 
-def rewrite(data, changes):
+def rewrite(data, changes, begin=b""):
     meta = meta_of(data)
     put(meta, changes)
-    (data / "transforms.json").write_text(json.dumps(meta), encoding="utf-8")
+    (data / "transforms.json").write_bytes(begin + json.dumps(meta).encode())
 
 
 def as_text(data):
@@ -125,6 +125,7 @@ REFUSED = {
     "a round lens of a whole number": ({**ROUND, "fisheye_crop_radius": 7}, "with a decimal point"),
     "a round lens and masks": ({**ROUND, "fisheye_crop_radius": 7.0, "frames": masked(FIRST)}, "remove mask_path"),
     "distortion NaN": ({"k1": NAN}, "k1 is nan"),
+    "a term of FULL_OPENCV": ({"frames/1/k6": 0.2}, "frame 1 .*k6 is 0.2; it must be 0, or undistorted: make"),
     "distortion of 3 numbers": ({"distortion_params": [0, 0, 0]}, "needs distortion_params of 6 numbers"),
     "a split of other images": ({"frames/1/file_path": "images/none.png"}, "which no frame has as file_path"),
     "a missing split": ({"train_filenames": ["a.png"], "val_filenames": None}, "train_filenames|val_filenames"),
@@ -324,6 +325,7 @@ FINE = {
     "one pixel": _one_pixel,
     "masks": _masked,
     "unicode and spaces in names": _renamed,
+    "a mark of UTF-8": lambda data: rewrite(data, {"skew": 0.0}, b"\xef\xbb\xbf"),
     "no points": lambda data: rewrite(data, {"ply_file_path": GONE}),
 }
 
