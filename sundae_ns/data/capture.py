@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from sundae_ns.core.errors import DataError, reading, regular
-from sundae_ns.data.lenses import DISTORTION, FISHEYE624, INTRINSICS, RECTIFY, kind_of_model, lens_of, with_focal_lengths
+from sundae_ns.data.lenses import DISTORTION, FISHEYE624, INTRINSICS, REMEDY, kind_of_model, lens_of, with_focal_lengths
 
 _MAX_SIDE = 65535  # pixels: JPEG's limit
 _LARGEST = 1e12  # its square must stay in the range of float32
@@ -134,7 +134,7 @@ _numbers = _must(
     "a list of 4, 6 or 12 finite numbers",
 )
 _radius = _must(lambda px: isinstance(px, float) and 0 < px < math.inf, "a positive number with a decimal point")
-_tiny = _must(lambda value: type(value) in (int, float) and abs(value) < 1e-3, f"0, or undistorted: {RECTIFY}")
+_tiny = _must(lambda value: type(value) in (int, float) and abs(value) < 1e-3, f"0, or undistorted: {REMEDY}")
 # The check of each entry of a file or of a frame, called with its value, its name and where it stands.
 _CHECKS: dict[str, Callable[[Any, str, str], Any]] = {
     **dict.fromkeys(("w", "h"), side),

@@ -33,7 +33,7 @@ COLMAP_LENSES: dict[str, tuple[int, str | None, str, str]] = {
 }
 """COLMAP's camera models: number, kind (None if there is none), parameters in their order, and those that must be 0."""
 _KINDS = {name: kind for name, (_, kind, _, z) in COLMAP_LENSES.items() if kind and not z} | {FISHEYE624: FISHEYE624}
-RECTIFY = "make undistorted images with `colmap image_undistorter`, or calibrate the capture with OPENCV"
+REMEDY = "make undistorted images with `colmap image_undistorter`, or calibrate the capture with OPENCV"
 _ONE_EYE = "render or cut perspective images (cube faces) of one eye, each with its own pose"
 _REMEDIES = {
     "EQUIRECTANGULAR": "the images are panoramas: cut them into perspective images with `ns-process-data images "
@@ -63,7 +63,7 @@ def _refusal(model: str, where: str, otherwise: str = "") -> DataError:
     """The error for a projection, with a remedy of its own if there is one."""
     remedy = next((remedy for start, remedy in _REMEDIES.items() if model.startswith(start)), None)
     what = f"camera model {model} is no lens that perspective images can be made of; {remedy}"
-    otherwise = otherwise or f"nerfstudio does not support camera model {model}; {RECTIFY}"
+    otherwise = otherwise or f"nerfstudio does not support camera model {model}; {REMEDY}"
     return DataError(f"{where}: {what if remedy else otherwise}")
 
 
