@@ -76,9 +76,8 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
         return normalized[rows, None, None] * covariance
 
     covariance = total(moments, 3, 3)
-    # A covariance that overflows has no axes; its Gaussian stays unchanged.
-    bounded = covariance.isfinite().all(dim=2).all(dim=1)
-    deviations, quats = scales_and_quaternions(torch.where(bounded[:, None, None], covariance, 0.0))
+    # A covariance that overflows has no finite widths, so its Gaussian stays unchanged.
+    deviations, quats = scales_and_quaternions(covariance)
     # A width of zero has no logarithm; limit each axis to the thinnest axis of the members.
     thinnest = torch.full_like(largest, torch.inf)
     for rows in chunks(len(members)):
@@ -95,7 +94,7 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
     merged |= {"means": origin + shift, "scales": deviations.log(), "quats": quats}
     depth = merged_depth.clamp(torch.finfo(merged_depth.dtype).tiny, -math.log1p(-MAX_OPACITY))
     merged["opacities"] = (depth + torch.log(-torch.expm1(-depth)))[:, None]  # logit of 1 - exp(-depth)
-    changed = (torch.bincount(group, minlength=count) > 1) & (largest > 0) & bounded
+    changed = (torch.bincount(group, minlength=count) > 1) & (largest > 0)
     for value in merged.values():
         changed &= value.reshape(count, -1).isfinite().all(dim=1)
     result = {name: value.clone() for name, value in kept.items()}
