@@ -47,9 +47,8 @@ def chunks(n: int, size: int | None = None) -> Iterator[slice]:
     return (slice(first, min(first + size, n)) for first in range(0, n, size))
 
 
-def quaternions(matrices: Tensor) -> Tensor:
-    """Unit wxyz quaternions ``[N, 4]`` of rotation matrices ``[N, 3, 3]``."""
-    m = matrices
+def quaternions(m: Tensor) -> Tensor:
+    """Unit wxyz quaternions ``[N, 4]`` of rotation matrices ``m`` ``[N, 3, 3]``."""
     xx, yy, zz = m.diagonal(dim1=1, dim2=2).unbind(dim=1)
     squares = torch.stack([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz], dim=1)
     wx, wy, wz = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]
@@ -102,9 +101,10 @@ def overlap(means: Tensor, entries: Tensor, first: Tensor, second: Tensor, least
     Without ``least_variance``, added to all axes, parallel flat Gaussians would not overlap however close they are.
     """
     first, second = first.to(means.device), second.to(means.device)
-    entries = entries + least_variance * entries.new_tensor([1, 1, 1, 0, 0, 0])
+    entries = entries + least_variance * entries.new_tensor([1, 1, 1, 0, 0, 0]) if least_variance else entries
     log_det, points = entries.new_empty(len(means)), means.double()
-    for rows in chunks(len(means)):
+    asked = torch.bincount(torch.cat([first.flatten(), second.flatten()]), minlength=len(means)).nonzero().squeeze(1)
+    for rows in asked.split(ROWS):
         log_det[rows] = 2 * torch.stack(_cholesky(entries[rows], least_variance)[:3], dim=1).log().sum(dim=1)
     result = torch.empty(second.shape, dtype=means.dtype, device=means.device)
     for rows in chunks(len(second), max(1, PAIRS // max(1, second[:1].numel()))):

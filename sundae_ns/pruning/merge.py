@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -92,12 +93,10 @@ def pair_labels(params: Mapping[str, Tensor], graph: NeighborGraph, weight: Tens
         chosen = chosen[: min(left - count, max(1, round(PART * len(chosen))))]
         stays, goes = groups.join(pairs[0][chosen], pairs[1][chosen])
         left -= len(chosen)
-        target = torch.arange(n, device=device)
-        target[goes] = stays
+        target = torch.arange(n, device=device).index_copy_(0, goes, stays)
         label = torch.where(label >= 0, target[label.clamp_min(0)], -1)
         # Only pairs of a changed group change.
-        changed = torch.zeros(n, dtype=torch.bool, device=device)
-        changed[stays] = changed[goes] = True
+        changed = torch.zeros(n, dtype=torch.bool, device=device).index_fill_(0, torch.cat([stays, goes]), True)
         moved = changed.index_select(0, pairs[0]) | changed.index_select(0, pairs[1])
         rest, moved = (mask.nonzero().squeeze(1) for mask in (~moved, moved))
         renewed = _unique(tuple(target.index_select(0, ends.index_select(0, moved)) for ends in pairs), n)
@@ -148,7 +147,8 @@ def _unique(ends: tuple[Tensor, ...], n: int) -> tuple[Tensor, Tensor]:
     """Each pair of two different groups once, the lower index first; none of a negative index."""
     # All of pairs is picked by index_select: a CPU takes twice as long by brackets.
     low, high = torch.minimum(*ends), torch.maximum(*ends)
-    keys = torch.unique((low * n + high).masked_select((low >= 0) & (low < high)))
+    keys = (low * n + high).masked_select((low >= 0) & (low < high))
+    keys = torch.from_numpy(np.unique(keys.numpy())) if keys.is_cpu else torch.unique(keys)  # torch's takes four times
     return keys.div(n, rounding_mode="floor"), keys % n
 
 
