@@ -140,14 +140,14 @@ def _float32_step(centres: Array) -> float:
     return step / usual if usual > 0 else 0.0
 
 
-class _FarOutputs(DataparserOutputs):
+class _SurveyOutputs(DataparserOutputs):
     """A parsed capture whose transform has float64 numbers, as it leads away from survey coordinates."""
 
     def transform_poses_to_original_space(self, poses: Tensor, *args: Any, **options: Any) -> Tensor:
         return super().transform_poses_to_original_space(poses.double(), *args, **options)
 
 
-class _Placed:
+class _PosedParser:
     """What both parsers do with poses, points and lenses, from the file's coordinates to those of the model."""
 
     config: Any
@@ -178,7 +178,7 @@ class _Placed:
         transform = outputs.dataparser_transform.double()
         transform[:, 3] -= self._transform[:, :3].double() @ torch.from_numpy(self.offset)
         known = {entry.name: getattr(outputs, entry.name) for entry in fields(outputs)}
-        return _FarOutputs(**{**known, "dataparser_transform": transform})
+        return _SurveyOutputs(**{**known, "dataparser_transform": transform})
 
     def _shift(self, frames: list[dict[str, Any]], points: Callable[[], Array | None], where: str) -> None:
         """Make the poses of frames float64 and rigid, near the origin if float32 is too coarse where they stand.
@@ -220,7 +220,7 @@ class _Placed:
         return oriented, self._transform
 
 
-class LightNerfstudioParser(_Placed, Nerfstudio):
+class LightNerfstudioParser(_PosedParser, Nerfstudio):
     """The ``nerfstudio-data`` parser; it takes the cloud of an old capture from COLMAP's model without a question."""
 
     applied_scale = 1.0  # Scale from the original coordinates of a capture to those of its file
@@ -289,7 +289,7 @@ class LightNerfstudioParser(_Placed, Nerfstudio):
         return {"points3D_xyz": points * (scale_factor / self.applied_scale), "points3D_rgb": rgb}
 
 
-class CarefulColmapParser(_Placed, ColmapDataParser):
+class CarefulColmapParser(_PosedParser, ColmapDataParser):
     """The ``colmap`` parser."""
 
     def _generate_dataparser_outputs(self, split: str = "train", **_: Any) -> DataparserOutputs:

@@ -87,9 +87,8 @@ def _sparse_gaussians(options: Any, points: Points | None, cap: int | None) -> t
             warnings.append(f"the capture has only {len(xyz)} sparse points: {few}")
     else:
         if not options.random_init:
-            better = "Results are better with one (COLMAP, or ply_file_path in transforms.json)."
             none = f"the capture has no sparse point cloud; starting from {options.num_random} random points"
-            warnings.append(f"{none}. {better}")
+            warnings.append(f"{none}. Results are better with one (COLMAP, or ply_file_path in transforms.json).")
         xyz = (torch.rand(options.num_random, 3) - 0.5) * options.random_scale
         rgb = torch.rand_like(xyz)
     if cap is not None and len(xyz) > cap:

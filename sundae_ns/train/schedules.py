@@ -218,7 +218,7 @@ def _resumed_run(config: Any, saved: Path) -> Any:
     """The configuration of the run that is resumed; None if it is not beside its checkpoints."""
     run, path = None, find_config(saved)
     try:
-        run = path and load_config(path)
+        run = None if path is None else load_config(path)
     except CheckpointError as error:
         log.warning(f"{error}; the run is resumed with the options of this command")
     return run if isinstance(run, type(config)) else None
