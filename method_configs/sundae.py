@@ -58,7 +58,6 @@ def method(
 ) -> MethodSpecification:
     """One method: its name and line in ``ns-train --help``, its length, and options of trainer and model."""
     cuda = torch.cuda.is_available()
-    camera_optimizer = CameraOptimizerConfig(mode="off")
     options: dict[str, Any] = {
         "steps_per_eval_batch": 0,
         "steps_per_save": 2000,
@@ -77,7 +76,7 @@ def method(
                 robust_frame=True,
             ),
             model=SundaeModelConfig(
-                pruning=pruning, head=head or HeadConfig(), camera_optimizer=camera_optimizer, **model
+                pruning=pruning, head=head or HeadConfig(), camera_optimizer=CameraOptimizerConfig(mode="off"), **model
             ),
         ),
         logging=LoggingConfig(
@@ -148,6 +147,7 @@ sundae_paper = method(
     stop_split_at=15000,
     base_loss_weight=0.0,
     average_share=0.0,
+    drop_rate=0.0,
     loss_after_prune="l1",
     prior_after_prune=0.0,
     exposure_compensation="off",

@@ -50,7 +50,7 @@ from sundae_ns.train.build import build
 from sundae_ns.train.curve import CurvePoint
 from sundae_ns.train.exposure import ExposureCompensation
 from sundae_ns.train.initialize import Start
-from sundae_ns.train.pruning import PruningConfig
+from sundae_ns.train.pruning import FEW_DROPPED, MANY_VIEWS, PruningConfig
 from sundae_ns.train.state import Callback, Photo, TrainingState
 from sundae_ns.train.step import StepInputs, StepLosses, training_part
 from sundae_ns.train.trials import Trials
@@ -74,13 +74,12 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """Term beside SSIM: l1 is the paper's; rms, the root of the mean squared error, gains 0.1 to 0.3 dB."""
     prior_after_prune: float = 0.3  # Weight of opacities and scales in the loss once pruned, over the number of images
     average_share: float = 0.1  # Last share of the schedule over which weights are averaged; 0.1 gains 0.2 dB
-    drop_rate: float = 0.0  # Share of the Gaussians that a step leaves out at random; 0.2 suits few photos in one light
+    drop_rate: float | None = None  # Share that steps after the prune leave out; by default 0.2 below 32 photos, else 0
     exposure_compensation: Literal["auto", "on", "off"] = "auto"
     """Even out photos of changing exposure or white balance with their neighbours; auto does if half of them differ."""
     dense_start_views: int = 300
     """With at most this many training images, a plane sweep fills a sparse cloud to start from; 0 turns it off."""
-    warm_start: Path | None = None
-    """Start from Gaussians that are finished: a splatfacto or sundae .ckpt, its folder, a .sundae or .ply."""
+    warm_start: Path | None = None  # Finished Gaussians to start from: a .ckpt, its folder, a .sundae or a .ply
     warm_start_frame: Literal["auto", "model", "capture"] = "auto"
     """Coordinates of the warm start: nerfstudio's model, or the capture (COLMAP). auto decides by the kind of file."""
     stop_split_at: int = 12000
@@ -213,7 +212,9 @@ class SundaeModel(SplatfactoModel):
         """Settings of images at this step."""
         antialiased, absgrad = self.config.rasterize_mode == "antialiased", self.config.use_absgrad
         settings = self.state.render_settings(self.backend, antialiased=antialiased, training=training, absgrad=absgrad)
-        return replace(settings, drop_rate=self.config.drop_rate * training)
+        few = 0 < self.num_train_data < MANY_VIEWS
+        rate = FEW_DROPPED * few if self.config.drop_rate is None else self.config.drop_rate
+        return replace(settings, drop_rate=rate if training and self.state.pruned else 0.0)
 
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> MutableMapping[str, Any]:  # type: ignore[override]
@@ -300,10 +301,9 @@ class SundaeModel(SplatfactoModel):
         rising = config.num_downscales - step // config.resolution_schedule if config.warm_start is None else 0
         # Densification takes its statistics from whole images.
         cropped = state.head_enabled and not state.densifying
-        pixels = config.head.max_train_pixels if cropped else 0
         # Mirrored images help in the long run only.
         mirror = cropped and not state.provisional and config.head.mode != "features"
-        return StepResolution(step, int(2 ** max(rising, 0)), pixels, mirror)
+        return StepResolution(step, int(2 ** max(rising, 0)), config.head.max_train_pixels if cropped else 0, mirror)
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes

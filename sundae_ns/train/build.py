@@ -32,7 +32,7 @@ def check(options: Any) -> None:
         ("drop-rate", 0.9, "a share of the Gaussians, 0.2 for few photos"),
     ):
         value = getattr(options, name.replace("-", "_"))
-        if not 0 <= value <= most:
+        if value is not None and not 0 <= value <= most:
             raise ConfigError(f"{name} is {value}; give {remedy}")
     if options.warm_start is not None and options.pruning.mode == "continuous":
         raise ConfigError("a warm start is pruned at once, not while it grows: set pruning.mode to one-shot")

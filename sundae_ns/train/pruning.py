@@ -34,6 +34,7 @@ log = logging.getLogger(__name__)
 USUAL_SHARE = 0.1  # Share that a prune keeps unless it is told otherwise
 MANY_VIEWS = 32  # With as many, counts are tried, and no length is: captures of 43 training views gain to the end
 FEW_SHARE, USUAL_VIEWS = 0.05, 24  # Least share of the Gaussians that few views keep, and as many keep the usual share
+FEW_DROPPED = 0.2  # Share of the Gaussians that a step on few views leaves out after the prune, against overfitting
 NEVER = -1  # Value of state["pruned_at"] before the first prune
 UNPRUNED = {"pruned_at": NEVER, "num_prunes": 0, "peak": 0}  # Running state at the start; the peak is of Gaussians
 COUNT, VIEWS = "count", "views"
@@ -106,8 +107,7 @@ class PruningConfig(PruneRule):
         ``stop`` on at every step with more Gaussians than the target or, without a target, the cap.
         """
         if self.mode == "one-shot":
-            decided = not self.decides or COUNT in state
-            return decided and state["pruned_at"] == NEVER and step >= self.prune_at
+            return (not self.decides or COUNT in state) and state["pruned_at"] == NEVER and step >= self.prune_at
         if self.mode != "continuous":
             return False
         scheduled = self.start <= step <= self.stop and (step - self.start) % self.every == 0

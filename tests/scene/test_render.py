@@ -187,9 +187,15 @@ def test_one_primitive_has_no_response_to_show_and_few_have_one(build, camera, n
 
 
 def test_a_training_image_leaves_out_some_and_a_shown_one_none(build):
-    model = build(n=4000, drop_rate=0.2)
+    model = build(n=4000)  # of 4 photos
+    assert model.render_settings(training=True).drop_rate == 0, "the field still grows"
+    model.state.pruning["num_prunes"], model.state.densify_until = 1, 0
     settings, params = (model.render_settings(training=on) for on in (True, False)), model.state.gaussians
     dropped, whole = (pass_inputs(params, None, each).opacities for each in settings)
     assert torch.equal(whole, params["opacities"].sigmoid().squeeze(1))
     assert 0.16 < (dropped == 0).float().mean() < 0.24  # six deviations
     torch.testing.assert_close(dropped[dropped > 0], (whole / 0.8).clamp(max=1)[dropped > 0])
+    model.num_train_data = 32
+    assert model.render_settings(training=True).drop_rate == 0
+    model.config.drop_rate = 0.1
+    assert model.render_settings(training=True).drop_rate == 0.1

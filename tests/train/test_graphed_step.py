@@ -67,7 +67,7 @@ GROWTH = {
     [
         GROWTH,
         {**GROWTH, "use_absgrad": True},
-        {"pruning": {"mode": "off"}, "head": {"mode": "off"}, "drop_rate": 0.2},
+        {"pruning": {"prune_at": 4}, "head": {"mode": "off"}, "drop_rate": 0.2, "stop_split_at": 4},
         {"sh_degree": 0, "head": {"mode": "features"}},
     ],
     ids=["densify", "absgrad", "no-head", "logits"],
