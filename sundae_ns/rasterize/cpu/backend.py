@@ -18,7 +18,7 @@ from torch.autograd.function import once_differentiable
 from sundae_ns.core.errors import BackendError
 from sundae_ns.rasterize import reference
 from sundae_ns.rasterize.cpu.compositing import composite
-from sundae_ns.rasterize.cpu.parallel import as_array, compiled, inlined, parallel_for
+from sundae_ns.rasterize.cpu.parallel import as_array, borrowing, compiled, inlined, parallel_for
 from sundae_ns.rasterize.cpu.tiles import MIN_PER_THREAD, tile_lists
 from sundae_ns.rasterize.reference import BLUR, FOV_MARGIN, MAX_RADIUS, Projection, blended_values
 from sundae_ns.rasterize.types import Inputs, Rasterization, result_of
@@ -26,7 +26,7 @@ from sundae_ns.rasterize.types import Inputs, Rasterization, result_of
 _SHORTEST = 1e-12  # lower bound of a vector's divisor, as in torch's normalize()
 _TERMS = 25  # harmonics of degree 4
 
-_write_basis = compiled(reference.write_basis)
+_write_basis = borrowing(reference.write_basis)
 
 
 class CpuBackend:
@@ -116,7 +116,7 @@ def project(inputs: Inputs) -> Projection:
     return Projection(means2d, covars2d, conics, depths, compensations, radii)
 
 
-@compiled
+@borrowing
 def _rotation(quats: Any, i: int, out: Any) -> float:
     """Write a quaternion's rotation matrix ``[3, 3]`` and its unit form ``[3, :]``; return its length."""
     w, x, y, z = float(quats[i, 0]), float(quats[i, 1]), float(quats[i, 2]), float(quats[i, 3])
@@ -129,7 +129,7 @@ def _rotation(quats: Any, i: int, out: Any) -> float:
     return length
 
 
-@compiled
+@borrowing
 def _to_camera(camera: Any, means: Any, i: int) -> tuple[float, float, float, bool]:
     """Camera coordinates of a centre, and whether z, rounded to the dtype of the centres, is between the planes."""
     matrix, _, _, planes, _ = camera
@@ -327,7 +327,7 @@ def _evaluate_backward(
         grad_directions[i, 2] = (grad_z - z * radial) / length
 
 
-@compiled
+@borrowing
 def _unit(directions: Any, i: int) -> tuple[float, float, float, float]:
     """A direction's unit vector and its length."""
     x, y, z = float(directions[i, 0]), float(directions[i, 1]), float(directions[i, 2])
@@ -335,7 +335,7 @@ def _unit(directions: Any, i: int) -> tuple[float, float, float, float]:
     return x / length, y / length, z / length, length
 
 
-@compiled
+@borrowing
 def _slope(degree: int, x: float, y: float, z: float, w: Any) -> tuple[float, float, float]:
     """Gradient of the harmonics' sum with weights ``w``: the derivatives of the polynomials."""
     grad_x = grad_y = grad_z = 0.0
