@@ -15,7 +15,7 @@ from sundae_ns.cli.refusals import check_exclusive, check_file, check_least, che
 from sundae_ns.core.errors import ConfigError
 from sundae_ns.pruning.rule import PruneRule, ScoreName
 from sundae_ns.rasterize.interface import fastest_device
-from sundae_ns.scene.compose import OTHERS, UNSEEN
+from sundae_ns.scene.compose import OTHERS
 from sundae_ns.scene.load_save import SUFFIXES, save
 
 
@@ -84,7 +84,7 @@ def prune(
         left.write(out)
         print(f"{out}: {left.scene.num_gaussians:,} of {len(left.rows):,} Gaussians")
         if left.pruned is not None and left.pruned.seen is not None:
-            what = f"; {OTHERS}" if before.cameras and left.pruned.seen < 1 - UNSEEN else ""
+            what = f"; {OTHERS}" if before.cameras and left.pruned.seen < 0.92 else ""
             print(f"{len(left.cameras)} cameras see {left.pruned.seen:.1%} of the Gaussians{what}")
     before.print_cost(out)
     return 0

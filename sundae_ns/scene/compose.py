@@ -23,7 +23,7 @@ from sundae_ns.pruning.floaters import STRENGTH, floater_odds
 from sundae_ns.scene.prune_scene import weights_in
 from sundae_ns.scene.scene import Scene, unit, usable_cameras, within
 
-UNSEEN = 0.14  # share of the Gaussians: cameras of seven captures see no 12% at most, in other coordinates 16% and more
+HARDLY_SEEN = 0.2  # share below 1% of the mean weight: up to 0.10 in seven captures, in other coordinates from 0.35 on
 OTHERS = "if the cameras are not in the coordinates of the scene, give those of its own run or capture"
 _log = logging.getLogger(__name__)
 
@@ -214,8 +214,8 @@ def floater_mask(
     floats = floater_odds(sanitised.gaussians) > 2 - 8 * strength**0.5  # logarithms
     if cameras:
         usable = dataclasses.replace(scene, gaussians=sanitised.gaussians)
-        unseen = weights_in(usable, for_cleaning(cameras), console=console) <= 0
-        if (count := int(unseen.sum())) > UNSEEN * len(unseen):
-            _log.warning("no camera sees %s of %s Gaussians, which go; %s", f"{count:,}", f"{len(unseen):,}", OTHERS)
-        floats |= unseen
+        weights = weights_in(usable, for_cleaning(cameras), console=console)
+        if (share := float((weights < 0.01 * weights.mean()).float().mean())) > HARDLY_SEEN:
+            _log.warning("the cameras hardly see %.0f%% of the Gaussians; %s", 100 * share, OTHERS)
+        floats |= weights <= 0
     return ~within(sanitised.mask, ~floats)
