@@ -29,11 +29,11 @@ from sundae_ns.io.pack import container
 from sundae_ns.io.ply import has_own_columns, keep_vertices
 from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.rasterize.interface import fastest_device
-from sundae_ns.scene.cameras import cameras_of, with_start
+from sundae_ns.scene.cameras import cameras_of, opening, with_start
 from sundae_ns.scene.compose import crop_mask, floater_mask, transform
 from sundae_ns.scene.describe import write_preview
 from sundae_ns.scene.load_save import load, load_with_mask, save
-from sundae_ns.scene.page import packed_of
+from sundae_ns.scene.page import Shown, shown_as
 from sundae_ns.scene.prune_scene import Form, PrunedScene, count_for_drop, prune_to_bytes, prune_with_mask
 from sundae_ns.scene.scene import Scene, within
 from sundae_ns.scene.virtual_cameras import VIEWS, virtual_cameras
@@ -117,6 +117,7 @@ class Edit(NamedTuple):
             return edit
         with naming_full_memory(lambda: len(self.rows)):
             scene, cameras = edit.scene.to(fastest_device()), edit.cameras
+            scene = opening(scene) if out.suffix.lower() == ".html" else scene  # once, not for each file of a search
             rule = replace(rule or PruneRule(), seed=self.details.seed or 0)
             if rule.uses_contribution or wishes.max_mb is not None or target_drop is not None:
                 cameras = cameras or virtual_cameras(scene, num_cameras, seed=rule.seed)
@@ -143,13 +144,13 @@ class Edit(NamedTuple):
                 pruned, form, file = prune_to_bytes(scene, most, file_of, forms, cameras, rule)
             return after(pruned, form)._replace(file=file)
 
-    def shown(self) -> tuple[str, Scene, bytes]:
+    def shown(self) -> Shown:
         """Name, scene and packed file of what a page shows; a packed scene stays as it is."""
         left, name, details = self.reduced(Path("page.html")), self.source.resolve().stem, self.details
         if is_run(self.source):  # its file is CAPTURE/METHOD/TIME/config.yml
             name = config_of(self.source).resolve().parents[2].name
         if kind_of(self.source) != "packed" or self.wishes.cleans or self.wishes.reduces or details.no_head:
-            return name, left.stated, packed_of(left.stated, left.form.precision)
+            return shown_as(name, left.stated, left.form.precision)
         packed = self.source.read_bytes()
         if details.start_view is not None or details.up is not None:
             from sundae_ns.scene.packing import stated_start  # its encoder needs a compiler, which other files do not

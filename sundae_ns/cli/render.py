@@ -12,7 +12,7 @@ from sundae_ns.cli.refusals import check_file, check_least, check_suffix
 from sundae_ns.core.errors import ConfigError
 from sundae_ns.core.files import replacing, write_image, write_video
 from sundae_ns.rasterize.interface import fastest_device
-from sundae_ns.scene.cameras import camera_in_front, film_views, read_cameras
+from sundae_ns.scene.cameras import film_views, opening, read_cameras
 from sundae_ns.scene.scene import image_of
 from sundae_ns.scene.scene import render as render_view
 
@@ -51,14 +51,14 @@ def render(
     wishes.check_wishes()
     check_file(out, reads=[scene, camera, advanced.cameras], overwrite=advanced.overwrite)
     shown = opened(scene, wishes, advanced).reduced(Path("scene.sundae")).stated
-    views, speed = list(shown.cameras) or [camera_in_front(shown)], None
+    views, speed = list(shown.cameras), None
     if camera is not None:
         views, speed = read_cameras(camera, shown)
     elif video:
         with Console(stderr=True).status("Finding a path"):
             views = film_views(shown, seconds=12.0 if seconds is None else seconds, frames_per_second=fps or 24)
-    elif view is None and shown.start is not None:
-        views = [shown.start]
+    elif view is None or not views:
+        views = [start] if (start := opening(shown).start) is not None else views
     views = [each if width is None else each.zoomed(width / each.width) for each in views]
     if video:  # whose colours have half the size
         views = [each._replace(width=each.width // 2 * 2, height=each.height // 2 * 2) for each in views]

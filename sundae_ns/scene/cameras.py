@@ -1,4 +1,4 @@
-"""Cameras of a scene: those of a file, one in front of it, its start view, and a path for a film."""
+"""Cameras of a scene: those of a file, its start view, and a path for a film."""
 
 from __future__ import annotations
 
@@ -13,29 +13,23 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sundae_ns.core.camera import OPENGL_TO_OPENCV, Camera, poses_looking_at
+from sundae_ns.core.camera import OPENGL_TO_OPENCV, Camera, poses_looking_at, world_to_camera
 from sundae_ns.core.covariance import rotation_matrices
 from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.data.capture import finite, matrix, read_json, rigid, side
 from sundae_ns.data.colmap import read_images
 from sundae_ns.data.lenses import kind_of_frame, with_focal_lengths
 from sundae_ns.scene.scene import Scene, unit
-from sundae_ns.scene.virtual_cameras import FOV, middle_and_reach, usable, virtual_cameras
+from sundae_ns.scene.virtual_cameras import FOV, front_views
 
 MOST_FRAMES = 36_000  # of a film: 25 minutes
 MOST_CAMERAS = 10_000  # of a file
 Pinhole = tuple[np.ndarray, Sequence[float], int, int]  # OpenGL camera-to-world [3 or 4, 4], fx fy cx cy, width, height
 
 
-def camera_in_front(scene: Scene) -> Camera:
-    """A camera of 640 x 480 pixels for a scene without cameras: with z upwards it looks along y."""
-    means = scene.gaussians["means"].detach().cpu()
-    center = means.median(dim=0).values
-    away = 3 * float((means - center).norm(dim=1).median().clamp_min(1e-6))
-    up = torch.tensor(scene.up or (0.0, 0.0, 1.0))
-    side = torch.tensor([1.0, 0.0, 0.0] if abs(float(up[0])) < 0.9 else [0.0, 1.0, 0.0])
-    back = torch.nn.functional.normalize(torch.linalg.cross(side, up), dim=0)
-    return Camera.look_at(center + away * back, center, up, fov=2 * math.degrees(math.atan(240 / 500)))  # as the page
+def opening(scene: Scene) -> Scene:
+    """The scene with a start view if it has neither that nor cameras: the first of :func:`.front_views`."""
+    return scene if scene.start or scene.cameras else dataclasses.replace(scene, start=front_views(scene, 1)[0])
 
 
 def cameras_of(path: Path | str, scene: Scene | None = None) -> list[Camera]:
@@ -164,7 +158,7 @@ def film_views(scene: Scene, *, seconds: float = 12.0, frames_per_second: float 
     """Cameras of a film, one a frame, along a closed, smooth path at an even speed of motion and turning, upright.
 
     It leads through up to eight stored cameras, from the start view, else the first, on the shortest way; with fewer
-    than three on a circle around the middle. Up is that of the scene, else the mean of its cameras', else z; lens and
+    than three through :func:`.front_views`. Up is that of the scene, else the mean of its cameras', else z; lens and
     shape are those of the first camera, with at most 1,280 pixels a side. ``ConfigError`` for an impossible length.
     """
     count = round(seconds * frames_per_second) if math.isfinite(seconds * frames_per_second) else 0
@@ -175,12 +169,13 @@ def film_views(scene: Scene, *, seconds: float = 12.0, frames_per_second: float 
     if scene.up is None and scene.cameras:
         mean = torch.stack([camera.pose[:, 1] for camera in scene.cameras]).double().mean(dim=0)
         up = np.array(unit(mean.tolist())) if float(mean.norm()) > 1e-3 else up
-    cameras = [camera for camera in (scene.start, *scene.cameras) if camera is not None]
-    lens = cameras[0] if cameras else Camera.from_fov(torch.eye(4), FOV, 1280, 720)
-    poses = np.array([camera.pose.double().tolist() for camera in cameras]).reshape(-1, 3, 4)
-    poses = poses[np.abs(poses[:, :, 2] @ up) < _STEEP]
-    poses = poses[np.sort(np.unique(poses.round(5), axis=0, return_index=True)[1])]
-    eyes, ahead = (poses[:, :, 3], -poses[:, :, 2]) if len(poses) >= 3 else _circle(scene, up)
+    stored = [camera for camera in (scene.start, *scene.cameras) if camera is not None]
+    lens = stored[0] if stored else Camera.from_fov(torch.eye(4), FOV, 1280, 720)
+    different = {str(camera.pose.double().round(decimals=5).tolist()): camera for camera in stored}
+    cameras = [camera for camera in different.values() if abs(camera.pose[:, 2].double().numpy() @ up) < _STEEP]
+    cameras = cameras if len(cameras) >= 3 else front_views(dataclasses.replace(scene, up=unit(up)))
+    poses = np.array([camera.pose.double().tolist() for camera in cameras])
+    eyes, ahead = poses[:, :, 3], -poses[:, :, 2]
     # One unit of motion counts as much as a turn by a radian.
     scale = max(float(np.median(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1))), 1e-9)
     keys = _tour(np.hstack([eyes / scale, ahead]))
@@ -188,22 +183,7 @@ def film_views(scene: Scene, *, seconds: float = 12.0, frames_per_second: float 
     centers = torch.from_numpy(path[:, :3] * scale)
     moved = poses_looking_at(centers, centers + torch.from_numpy(path[:, 3:]), torch.from_numpy(up))
     lens = lens.zoomed(min(1280 / max(lens.width, lens.height), 1.0))
-    intrinsics = [float(lens.K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))]
-    return [Camera.from_pose(pose, intrinsics, lens.width, lens.height) for pose in moved]
-
-
-def _circle(scene: Scene, up: Array) -> tuple[Array, Array]:
-    """Eyes on a circle, at the median distance and height of the virtual cameras, and directions to its middle."""
-    middle, reach = middle_and_reach(usable(scene))
-    center = middle.numpy()
-    arms = np.stack([camera.center.double().numpy() for camera in virtual_cameras(scene, 48)]) - center
-    height = np.median(arms @ up).clip(-0.5 * reach, 0.5 * reach)
-    side = np.cross(up, np.roll(up, 1) + [1e-3, 0.0, 0.0])
-    side /= np.linalg.norm(side)
-    angles = np.arange(8) * (math.pi / 4)
-    radius = np.median(np.linalg.norm(arms, axis=1))
-    arms = radius * (np.cos(angles)[:, None] * side + np.sin(angles)[:, None] * np.cross(up, side)) + height * up
-    return center + arms, -arms / np.linalg.norm(arms, axis=1, keepdims=True)
+    return [lens._replace(viewmat=viewmat) for viewmat in world_to_camera(moved.float())]
 
 
 def _tour(points: Array, most: int = 8) -> Array:

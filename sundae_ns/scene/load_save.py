@@ -21,7 +21,7 @@ from sundae_ns.io.formats import FORMATS, kind_of
 from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.io.ply import Marks
 from sundae_ns.scene.cameras import is_frame
-from sundae_ns.scene.page import opened_page, packed_of, write_page
+from sundae_ns.scene.page import opened_page, packed_of, shown_as, write_page
 from sundae_ns.scene.scene import Scene
 
 SUFFIXES = (*FORMATS, ".sundae", ".html")  # of the files that save() writes
@@ -109,7 +109,7 @@ def save(scene: Scene, path: Path | str, *, upright: bool = False, config: PackC
     if suffix in FORMATS:
         formats.write_for_viewers(path, scene.gaussians, marks_of(scene), upright=upright)
     elif suffix == ".html":
-        write_page(path, (path.resolve().stem, scene, packed_of(scene, config)))
+        write_page(path, shown_as(path.resolve().stem, scene, config))
     else:
         write_bytes(path, packed_of(scene, config))
 

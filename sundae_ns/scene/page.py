@@ -26,7 +26,7 @@ from sundae_ns.core.errors import ConfigError, MemoryExhaustedError, PackError, 
 from sundae_ns.core.files import write_files
 from sundae_ns.core.values import whole
 from sundae_ns.io.pack.config import PackConfig
-from sundae_ns.scene.cameras import camera_in_front
+from sundae_ns.scene.cameras import opening
 from sundae_ns.scene.scene import Scene, image_of, render
 from sundae_ns.scene.virtual_cameras import middle_and_reach, usable
 
@@ -56,7 +56,13 @@ def page(scenes: Scene | Mapping[str, Scene], path: Path | str, *, views: Mappin
     """
     path = Path(path)
     named = {path.resolve().stem: scenes} if isinstance(scenes, Scene) else dict(scenes)
-    write_page(path, *((name, scene, packed_of(scene)) for name, scene in named.items()), views=views)
+    write_page(path, *(shown_as(name, scene) for name, scene in named.items()), views=views)
+
+
+def shown_as(name: str, scene: Scene, config: PackConfig | None = None) -> Shown:
+    """What a page shows of a scene, packed with the settings ``config``, by default the default ones."""
+    scene = opening(scene)
+    return name, scene, packed_of(scene, config)
 
 
 def packed_of(scene: Scene, config: PackConfig | None = None) -> bytes:
@@ -134,7 +140,7 @@ def _poster(scene: Scene) -> str:
 
 def render_first(scene: Scene) -> Image.Image:
     """The image of the start view, else of the first camera, head included, at most 640 pixels wide and high."""
-    camera = scene.start or (scene.cameras[0] if scene.cameras else camera_in_front(scene))
+    camera = opening(scene).start or scene.cameras[0]
     return image_of(render(scene, camera.zoomed(min(640 / max(camera.width, camera.height), 1.0))).rgb)
 
 
@@ -173,8 +179,7 @@ def show(scene: Scene, *, height: int = 480, title: str = "Scene") -> Embedded:
     Embedded(title='Scene', height=300)
     """
     height = whole(height, "height")
-    content = page_of((title, scene, packed_of(scene)))
+    content = page_of(shown_as(title, scene))
     if len(content) > LARGE:
-        size = len(content) / 1e6
-        _log.warning("the notebook will hold a page of %.1f MB; prune the scene first, or save it as scene.html", size)
+        _log.warning("the notebook holds a page of %.1f MB; prune it, or save it as scene.html", len(content) / 1e6)
     return Embedded(content, title, height)

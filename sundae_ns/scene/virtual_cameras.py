@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import TypeVar
 
 import torch
@@ -43,9 +44,9 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
     """Cameras that see a scene as a visitor would, for scenes without cameras.
 
     Gaussians show where the photographs were taken: training splits them until each covers few pixels, so from there
-    all look small. Eyes around the middle of the scene look at random Gaussians; small images judge them by the
-    logarithm of the angle of the Gaussians that they show. Half of the cameras are the best of a few draws and moves by
-    its mean, the others by mean and deviation; in the end these look at random Gaussians, to see what is around them.
+    all look small. Eyes around the middle look at random Gaussians; small images judge them by the logarithm of the
+    angle of the Gaussians that they show. Half of the cameras are the best of some draws and moves by its mean, the
+    others by mean and deviation; these look at random Gaussians in the end, to see what is around them.
 
     Args:
         scene: its finite Gaussians count.
@@ -64,27 +65,23 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
     n = whole(by_device(VIEWS, scene.device) if n is None else n, "n")
     size = min(SIDE, max(64, 16 * math.isqrt(scene.num_gaussians))) if size is None else size
     gaussians = usable(scene)
-    means = gaussians["means"]
     middle, reach = middle_and_reach(gaussians)
     generator = torch.Generator().manual_seed(whole(seed, "seed", 0))
     probe, sizes = _probe(gaussians, middle, reach, generator)
     judge = dataclasses.replace(scene, gaussians=probe)
+    normal = partial(torch.randn, generator=generator, dtype=torch.float64)
 
     def random_targets(count: int) -> Tensor:
-        drawn = torch.randint(len(means), (count,), generator=generator)
-        return (means[drawn.to(means.device)].cpu().double() - middle) / reach
-
-    def normal(count: int) -> Tensor:
-        return torch.randn(count, 3, generator=generator, dtype=torch.float64)
+        drawn = torch.randint(gaussians.num_gaussians, (count,), generator=generator)
+        return (gaussians["means"][drawn.to(scene.device)].cpu().double() - middle) / reach
 
     def climb(n: int, evenness: float) -> tuple[Tensor, Tensor]:  # eyes and targets of n cameras
-        def best_of(eyes: Tensor, targets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            """The best of the cameras n apart, and their coarseness."""
+        def best_of(eyes: Tensor, targets: Tensor) -> tuple[Tensor, Tensor, Tensor]:  # those n apart, and coarseness
             coarseness = _coarseness(judge, sizes, eyes, targets, evenness).view(-1, n)
             best = coarseness.argmin(dim=0) * n + torch.arange(n)
             return eyes[best], targets[best], coarseness.amin(dim=0)
 
-        direction = torch.nn.functional.normalize(normal(FIRST * n), dim=1)
+        direction = torch.nn.functional.normalize(normal(FIRST * n, 3), dim=1)
         share = torch.rand(FIRST * n, 1, generator=generator, dtype=torch.float64)
         eyes = direction * NEAREST * (FARTHEST / NEAREST) ** share
         eyes, targets, coarseness = best_of(eyes, random_targets(FIRST * n))
@@ -96,7 +93,7 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
                 drawn = torch.searchsorted(chances.cumsum(0), points / n).clamp_max(n - 1)
                 eyes, targets, coarseness = eyes[drawn], targets[drawn], coarseness[drawn]
             near, ahead = eyes.repeat(MOVED, 1), targets.repeat(MOVED, 1)
-            moved = near + STEP / 3**0.5 * near.norm(dim=1, keepdim=True) * normal(len(near))
+            moved = near + STEP / 3**0.5 * near.norm(dim=1, keepdim=True) * normal(len(near), 3)
             turns = torch.rand(len(near), 1, generator=generator) < 0.5  # the others look at the same Gaussian
             moved, ahead, found = best_of(moved, torch.where(turns, random_targets(len(near)), ahead))
             better = found < coarseness
@@ -116,6 +113,24 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
         Camera.look_at(middle + reach * eye, middle + reach * target, up, fov=FOV, width=size, height=size)
         for eye, target in zip(eyes, targets, strict=True)
     ]
+
+
+def front_views(scene: Scene, n: int = 8) -> list[Camera]:
+    """Cameras of 640 x 480 pixels that look at the middle of a scene, the best first, for a page or a film of it.
+
+    They have the eyes of virtual cameras that see the smallest and most equal Gaussians; steep ones come last.
+    """
+    gaussians = usable(scene)
+    middle, reach = middle_and_reach(gaussians)
+    probe, sizes = _probe(gaussians, middle, reach, torch.Generator().manual_seed(0))
+    eyes = torch.stack([camera.center.double() for camera in virtual_cameras(scene, 48)]) - middle
+    up = scene.up or (0.0, 0.0, 1.0)
+    ahead, judge = torch.nn.functional.normalize(eyes, dim=1), dataclasses.replace(scene, gaussians=probe)
+    costs = _coarseness(judge, sizes, eyes / reach, torch.zeros_like(eyes), EVENNESS)
+    costs += 1e3 * ((ahead @ eyes.new_tensor(up)).abs() > 0.6)
+    costs += 1e3 * (ahead @ ahead[costs.argmin()] < 0.3)  # a film from both sides would cross the scene
+    best = eyes[costs.argsort()[:n]]
+    return [Camera.look_at(middle + eye, middle, up, fov=50, width=640, height=480) for eye in best]
 
 
 def of_unit_size(scene: Scene, cameras: Sequence[Camera]) -> tuple[Scene, list[Camera], float]:

@@ -24,12 +24,13 @@ from sundae_ns.io.pack import container
 from sundae_ns.plugin.dataparsers import camera_of
 from sundae_ns.plugin.distill import distill
 from sundae_ns.scene import virtual_cameras as virtual
-from sundae_ns.scene.cameras import camera_in_front, is_frame, read_cameras, with_start
+from sundae_ns.scene.cameras import is_frame, opening, read_cameras, with_start
 from sundae_ns.scene.packing import start_of, stated_start
 from sundae_ns.scene.page import render_first
 from sundae_ns.scene.prune_scene import prune_with_mask
 from sundae_ns.scene.render import StepResolution
 from sundae_ns.scene.scene import image_of
+from sundae_ns.scene.virtual_cameras import front_views
 
 FRAME = {"transform_matrix": [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]}
 LENS = {"fl_x": 50, "fl_y": 60, "cx": 32, "cy": 24, "w": 64, "h": 48}
@@ -391,15 +392,22 @@ def test_the_first_image_is_that_of_the_start_view():
 
 
 @pytest.mark.parametrize("up", [None, UP, (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (-0.95, 0.3122499, 0.0)])
-def test_the_camera_in_front_stands_upright(up):
-    camera = camera_in_front(two_seen(up=up))
-    wanted = torch.tensor(up or (0.0, 0.0, 1.0))
-    assert torch.allclose(camera.pose[:, 1], wanted, atol=1e-5)
-    for virtual_camera in sn.virtual_cameras(two_seen(up=up), 2, size=8):
-        assert abs(float(virtual_camera.pose[:, 0] @ wanted)) < 1e-5
-        assert float(virtual_camera.pose[:, 1] @ wanted) > 0
-    if up is None:
-        assert torch.allclose(camera.pose[:, 2], torch.tensor([0.0, -1.0, 0.0]), atol=1e-6)
+def test_virtual_cameras_stand_upright(up):
+    wanted, scene = torch.tensor(up or (0.0, 0.0, 1.0)), two_seen(up=up)
+    for camera in (*front_views(scene, 2), *sn.virtual_cameras(scene, 2, size=8)):
+        assert abs(float(camera.pose[:, 0] @ wanted)) < 1e-5
+        assert float(camera.pose[:, 1] @ wanted) > 0
+
+
+def test_a_page_opens_where_nothing_large_hides_the_middle():
+    generator = torch.Generator().manual_seed(0)
+    ball = torch.randn(2000, 3, generator=generator)
+    wall = torch.rand(60, 3, generator=generator) * 4 + torch.tensor([-2.0, -5.0, -2.0])  # on one side of it
+    scene = sn.Scene.from_points(torch.cat([ball, wall]), torch.full((2060, 3), 0.5))
+    scene.gaussians["scales"][2000:] += 2
+    eye = torch.nn.functional.normalize(opening(scene).start.center, dim=0)
+    assert eye[1] > -0.3
+    assert abs(eye[2]) < 0.6
 
 
 def test_options_name_a_view_or_a_file(tmp_path):

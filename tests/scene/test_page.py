@@ -317,7 +317,7 @@ def test_a_large_page_is_shown_with_a_warning(scene, monkeypatch, caplog):
     monkeypatch.setattr(page_module, "LARGE", 100_000)
     shown = sn.show(scene)
     assert frame_of(shown._repr_html_())["srcdoc"] == shown.page
-    assert re.search(r"a page of 0\.[2-9] MB; prune the scene first, or save it as scene.html", caplog.text)
+    assert re.search(r"a page of 0\.[2-9] MB; prune it, or save it as scene.html", caplog.text)
 
 
 @pytest.mark.browser

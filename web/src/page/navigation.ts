@@ -47,7 +47,7 @@ function middleOf({ field }: Scene): Vector3 {
   return new Vector3(along(0), along(1), along(2));
 }
 
-/** A camera in front of a scene without cameras: with z upwards it looks along y. The twin of view_in_front. */
+/** A camera in front of a scene without cameras and start view: with z upwards it looks along y. */
 function outside(scene: Scene, middle: Vector3): Camera {
   const distances: number[] = [];
   const place = new Vector3();
@@ -92,7 +92,7 @@ export class Navigation {
    */
   constructor(scene: Scene, element: HTMLElement) {
     this.middle = middleOf(scene);
-    this.stops = scene.cameras.length ? scene.cameras : [outside(scene, this.middle)];
+    this.stops = scene.cameras.length ? scene.cameras : [scene.start ?? outside(scene, this.middle)];
     this.lens = this.stops[0]!;
     this.camera.up.copy(scene.up ? new Vector3(...scene.up).normalize() : this.up());
     this.controls = new OrbitControls(this.camera, element);
