@@ -95,8 +95,7 @@ class SceneDetails(Details):
     """Options that few need."""
 
     cameras: File = None
-    """a transforms.json, a COLMAP model (sparse/0), a camera path, a run or a packed scene, whose cameras are taken in
-    place of those of the scene, or of virtual ones."""
+    """transforms.json, COLMAP model, camera path, run or pack, whose cameras replace the scene's or virtual ones."""
     data: File = None
     """folder of the capture of a run, if it moved."""
     preview: File = None
