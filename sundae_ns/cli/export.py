@@ -89,7 +89,7 @@ def export(
             task = bar.add_task("Levels of detail", total=None)
             trained = levels_of(levels[0], left.scene.cameras, lambda i, n: bar.update(task, completed=i, total=n))
             for level, psnr in trained:
-                print(f"{level.num_gaussians:,} Gaussians: {psnr:.2f} dB against the full scene, on cameras of no step")
+                print(f"{level.num_gaussians:,} Gaussians: {psnr:.2f} dB against the full scene, on held-out cameras")
                 levels.append(level)
         write_levels(out, [level.gaussians for level in levels], marks_of(levels[0]), upright=upright)
         print(f"{file}: {levels[0].num_gaussians:,} Gaussians and {len(levels) - 1} levels below")

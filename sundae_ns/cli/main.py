@@ -8,6 +8,7 @@ import importlib
 import io
 import logging
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -72,7 +73,7 @@ def _dispatch(words: Sequence[str]) -> int:
 
     if (flag := "--remove-floaters") in options:  # its number may be left out
         at = options.index(flag) + 1
-        options[at:at] = [] if "".join(options[at : at + 1]).replace(".", "", 1).isdigit() else ["0.25"]
+        options[at:at] = [] if re.fullmatch(r"-?[\d.]+", "".join(options[at : at + 1])) else ["0.25"]
     # Only the module of this command: some import torch, which takes a second.
     run = getattr(importlib.import_module(f"sundae_ns.cli.{name}"), name)
     return tyro.cli(run, prog=f"sundae {name}", args=options)

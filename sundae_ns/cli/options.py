@@ -22,8 +22,10 @@ NO_DEFAULT = tyro.conf.arg(help_behavior_hint="")  # in the help
 
 
 def _optional(kind: type[float], metavar: str) -> PrimitiveConstructorSpec[Any]:
-    """How a number that may be left out is read: errors and help of a union would name None beside it."""
-    return PrimitiveConstructorSpec(1, metavar, lambda words: kind(words[0]), lambda _: True, lambda x: [str(x)])
+    """How numbers that may be left out are read, one a word of the metavar: a union would name None beside them."""
+    several = len(metavar.split()) > 1
+    read = (lambda words: tuple(map(kind, words))) if several else lambda words: kind(words[0])
+    return PrimitiveConstructorSpec(len(metavar.split()), metavar, read, lambda _: True, lambda x: [str(x)])
 
 
 Int = Annotated[int | None, _optional(int, "INT"), NO_DEFAULT]
@@ -51,7 +53,7 @@ class Wishes:
     """number of Gaussians to keep, in place of a share."""
     max_mb: Float = None
     """size of the finished file in MB, its head and the code of a page included, in place of a share."""
-    crop: Annotated[Box | None, tyro.conf.arg(metavar="X Y Z X Y Z", help_behavior_hint="")] = None
+    crop: Annotated[Box | None, _optional(float, "X Y Z X Y Z"), NO_DEFAULT] = None
     """keep the Gaussians whose centres are in this box, in the file's coordinates: lowest x y z, then highest."""
     remove_floaters: Annotated[Float, tyro.conf.arg(metavar="[0 to 1]")] = None
     """remove what floats, and what no camera of the photographs sees: from 0, what surely does, to 1; bare 0.25."""
@@ -80,7 +82,7 @@ class Wishes:
 class Details:
     """Options that few need."""
 
-    up: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z", help_behavior_hint="")] = None
+    up: Annotated[tuple[float, float, float] | None, _optional(float, "X Y Z"), NO_DEFAULT] = None
     """direction that is upwards, for example 0 0 1; by default that of the scene, else of its cameras, else z."""
     start_view: Annotated[str | None, tyro.conf.arg(metavar="VIEW", help_behavior_hint="")] = None
     """what a page opens with: index of a stored camera, or a camera file; by default the scene's, else camera 0."""

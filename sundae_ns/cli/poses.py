@@ -28,12 +28,10 @@ class PoseOptions:
     """How poses are found."""
 
     matching: Literal["auto", "exhaustive", "sequential", "similar"] = "auto"
-    """photos that are compared: all pairs, neighbours in time and similar ones (for a video), or similar ones; by
-    default what suits their number."""
+    """photos that are compared: all, neighbours in time and similar ones, or similar ones; auto goes by the number."""
     frames: int = 150  # number of frames of a video; the sharpest of each stretch
     masks: File = None
-    """folder with a mask for each photo, under its name; training leaves out what is black. By default one named masks
-    beside the photos."""
+    """folder with a mask for each photo, under its name: training leaves out what is black; by default PATH/masks."""
 
 
 def poses(photos: Input, out: Out, options: Plain[PoseOptions] = PoseOptions()) -> int:  # noqa: B008

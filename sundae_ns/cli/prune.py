@@ -24,8 +24,7 @@ class RuleOptions(PruneRule):
     """The rule, with scores that have a name."""
 
     score: ScoreName = "detail-contribution"
-    """Importance of a Gaussian: its blending weight over the cameras, with pixels weighted by the detail that the kept
-    Gaussians cannot show (detail-contribution), or its high-pass response (response)."""
+    """How Gaussians are ranked: by what they blend where others cannot show the detail, or by high-pass response."""
     seed: tyro.conf.Suppress[int] = 0  # one for all draws of a command
 
 

@@ -114,7 +114,7 @@ def prune_with_mask(
     n = sanitised.gaussians.num_gaussians
     count = whole(count, "count") if keep is None else kept_count(keep, n)
     usable, given = dataclasses.replace(scene, gaussians=sanitised.gaussians), cameras or ()
-    console, images = Console(stderr=True) if progress else None, list[Tensor]()
+    console, images = Console(stderr=True) if progress and sys.stderr.isatty() else None, list[Tensor]()
     if not rule.uses_contribution or count >= n:
         weights = None
     elif weights is None:
@@ -314,8 +314,8 @@ def prune_to_bytes(
     counts = [min(n, int((AIM * most - fixed) / each)) for fixed, each in lines]
     possible = [(form, count) for form, count in zip(forms, counts, strict=True) if count > 0]
     if not possible:
-        raise ConfigError(f"a file without Gaussians has {lines[-1][0]:,.0f} bytes; give more than {most:,}")
-    console, images = Console(stderr=True), list[Tensor]()
+        raise ConfigError(f"a file without Gaussians has {lines[-1][0]:,.0f} bytes; ask for more than {most:,}")
+    console, images = Console(stderr=True) if sys.stderr.isatty() else None, list[Tensor]()
     graph = gaussian_graph(scene.gaussians, rule) if rule.uses_graph and n > 1 else None
     middle = max(sorted(counts)[len(counts) // 2], 1) if rule.uses_detail else None
     weights = weights_in(scene, cameras, middle, console, images) if rule.uses_contribution else None
@@ -401,5 +401,5 @@ def largest(
         guess = min(max(power + per_halving * math.log2(size / (AIM * most)), powers[0]), powers[1])
         before, power = (power, size), guess if low <= guess <= high and guess != power else (low + high) / 2
     if best is None:
-        raise ConfigError(f"the smallest file has {size:,} bytes; give more than {most:,}")
+        raise ConfigError(f"the smallest file has {size:,} bytes; ask for more than {most:,}")
     return best

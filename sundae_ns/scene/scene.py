@@ -386,7 +386,7 @@ def measure(
     stored = reference.cameras if isinstance(reference, Scene) else ()
     cameras = usable_cameras(cameras) if cameras is not None else stored or scene.cameras
     if not cameras:
-        raise DataError("there is no view to measure in; give views, such as sundae_ns.virtual_cameras(scene)")
+        raise DataError("there is no view to measure in; give cameras, such as sundae_ns.virtual_cameras(scene)")
     if isinstance(reference, Scene):
         scene = dataclasses.replace(scene, background_color=reference.background_color)
         targets = (render(reference, camera, head=head, backend=backend).rgb for camera in cameras)

@@ -244,7 +244,7 @@ def test_targets_that_cannot_be_met(tiny, scene, tmp_path, capsys):
     """One line, and no file."""
     assert run("pack", tiny.folder, "-o", tmp_path / "a.sundae", "--max-mb", 0.001) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
-    assert re.search("a file without Gaussians has .* bytes; give more than 1,000", line)
+    assert re.search("a file without Gaussians has .* bytes; ask for more than 1,000", line)
     assert not list(tmp_path.iterdir())
     with pytest.raises(ConfigError, match=r"finest pack loses 0\.50* dB at [\d,]+ bytes; give a larger --target-drop"):
         search(scene, lambda _: 0.5, scaled(PackConfig(), COARSEST)).better_than(0.1)
