@@ -308,7 +308,7 @@ def test_invalid_input_raises_one_line():
         (ConfigError, "training views", lambda: decide_share(params, DEFAULT)),
         (ConfigError, "set redistribution to none", lambda: decide_share(params, draws(score="response"))),
         (DataError, r"shape \[59\] for 60", lambda: decide_share(params, DEFAULT, 0.1, torch.ones(59))),
-        (ConfigError, "gamma", lambda: decide_share(params, draws(gamma=2.0))),
+        (ConfigError, "num_neighbors is 0: use at least 1", lambda: draws(num_neighbors=0)),
         (ConfigError, "gamma", lambda: decide(params, spoilt, 6)),
         (DataError, r"score has shape \[3\] for 60", lambda: decide(params, three, 6)),
     ]
