@@ -57,7 +57,6 @@ def method(
     **model: Any,
 ) -> MethodSpecification:
     """One method: its name and line in ``ns-train --help``, its length, and options of trainer and model."""
-    cuda = torch.cuda.is_available()
     options: dict[str, Any] = {
         "steps_per_eval_batch": 0,
         "steps_per_save": 2000,
@@ -68,7 +67,7 @@ def method(
         method_name=name,
         max_num_iterations=steps,
         mixed_precision=False,
-        machine=MachineConfig(device_type="cuda" if cuda else "cpu"),
+        machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
         pipeline=VanillaPipelineConfig(
             datamanager=SundaeDatamanagerConfig(
                 dataparser=NerfstudioDataParserConfig(load_3D_points=True),
@@ -80,7 +79,7 @@ def method(
             ),
         ),
         logging=LoggingConfig(
-            steps_per_log=100 if cuda else 10,  # TensorBoard waits for the GPU to read the figures of a step
+            steps_per_log=100 if torch.cuda.is_available() else 10,  # TensorBoard waits for the GPU to read a figure
             local_writer=LocalWriterConfig(_target=configs.ProgressWriter, enable=True),
         ),
         optimizers=optimizers(steps, plain=plain_optimizers),
@@ -171,5 +170,6 @@ sundae_tiny = method(
     reset_alpha_every=100,
     densify_grad_thresh=0.0016,
     cull_alpha_thresh=0.02,
+    drop_rate=0.0,  # of so few Gaussians each is missed
     dense_start_views=0,
 )

@@ -56,6 +56,7 @@ def test_configuration(name):
     modes = {"sundae-paper": "features", "sundae-tiny": "residual"}
     assert model.head.mode == modes.get(name, HeadConfig().mode)
     assert model.exposure_compensation == ("off" if paper else "auto")
+    assert model.drop_rate == (0 if paper or name == "sundae-tiny" else None)
     groups = {"means", "scales", "quats", "features_dc", "features_rest", "opacities", "features", "compensation"}
     assert groups <= set(config.optimizers)
     assert yaml.load(yaml.dump(config), Loader=yaml.Loader) == config
