@@ -37,7 +37,6 @@ def compare(
     formats: Flag = False,
     min_psnr: Float = None,
     lpips_net: Net = "alex",
-    warmup: int = 3,
     repeats: Int = None,
     overwrite: Overwrite = False,
 ) -> int:
@@ -56,12 +55,11 @@ def compare(
         formats: compare a scene with itself in every format: what each costs.
         min_psnr: exit with 1 if the mean PSNR of a scene is lower, dB.
         lpips_net: net of LPIPS, which is measured against photos if its weights are on disk.
-        warmup: untimed renderings of each view before timing.
         repeats: timed renderings of each view; 0 measures no times. By default 5 against photos, else 0.
     """
     if out is not None:
         check_folder(out, reads=[*scenes, data, cameras], overwrite=overwrite)
-    check_least(warmup=(warmup, 0), repeats=(repeats, 0), num_cameras=(num_cameras, 1))
+    check_least(repeats=(repeats, 0), num_cameras=(num_cameras, 1))
     scenes = sorted(scenes, key=lambda path: not is_run(path))  # a run says how photos are read
     photos = cameras is None and (data is not None or any(map(is_run, scenes)))
     if len(scenes) < (1 if photos or formats else 2):
@@ -77,7 +75,7 @@ def compare(
     missing = f"LPIPS: the weights of its net ({lpips_net}) are missing; sundae doctor says where to put them."
     notes = [missing] if photos and lpips is None else []
     done, failures = list[ShownRun](), list[SundaeError]()
-    measured_by = partial(measure, lpips=lpips, warmup=warmup, repeats=repeats, command=command)
+    measured_by = partial(measure, lpips=lpips, repeats=repeats, command=command)
     with progress_bar() as progress, TemporaryDirectory() as folder:
         if formats:
             whole, suffix = load(scenes[0]) if first is None else first.to("cpu"), scenes[0].suffix.lower()

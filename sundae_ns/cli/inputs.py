@@ -146,7 +146,8 @@ class Edit(NamedTuple):
 
     def shown(self) -> Shown:
         """Name, scene and packed file of what a page shows; a packed scene stays as it is."""
-        left, name, details = self.reduced(Path("page.html")), self.source.resolve().stem, self.details
+        left, details, source = self.reduced(Path("page.html")), self.details, self.source.resolve()
+        name = (source.parent if source.name == "scene.sundae" else source).stem  # sundae run names all packs so
         if is_run(self.source):  # its file is CAPTURE/METHOD/TIME/config.yml
             name = config_of(self.source).resolve().parents[2].name
         if kind_of(self.source) != "packed" or self.wishes.cleans or self.wishes.reduces or details.no_head:

@@ -91,7 +91,8 @@ class Project:
         """The steps in their order; a capture needs no poses."""
         packed, report, page = (self.out / name for name in ("scene.sundae", "report/report.html", "scene.html"))
         data, export = ("--data", word(self.capture)), ["sundae", "export", word(packed), "-o", word(page)]
-        measure = ["sundae", "compare", word(self.run), word(packed), *data, "-o", word(report.parent), "--overwrite"]
+        compared = [word(self.run), *([] if self.train.crop else [word(packed)])]  # photos show what a box leaves out
+        measure = ["sundae", "compare", *compared, *data, "-o", word(report.parent), "--overwrite"]
 
         def pack() -> int:
             return pack_run(self.run, packed, *data, *self.train.pack_words, finetune=self.tunes)

@@ -246,8 +246,9 @@ def test_names_with_a_dash_are_no_options(commands):
         assert paths
         assert all(path.startswith(("./-", "--experiment-name=")) for path in paths), words
     commands.ran.clear()
-    assert run("./-out/capture", "-o", "./-again", "--keep", "0.5") == 0
+    assert run("./-out/capture", "-o", "./-again", "--keep", "0.5", "--crop", 0, 0, 0, 1, 1, 1) == 0
     assert commands.option("--data", 0) == "./-out/capture"
+    assert "./-again/scene.sundae" not in commands.ran[-2], "photos show what a box leaves out"
 
 
 def test_one_command_works_in_a_folder(commands, capsys, monkeypatch):

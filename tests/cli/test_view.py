@@ -122,11 +122,14 @@ def test_a_browser_that_leaves_causes_no_traceback(capfd):
 
 @pytest.mark.parametrize("opens", [True, False])
 def test_view_opens_the_page(opens, tmp_path, monkeypatch, capsys):
-    packed = write_kind(tmp_path / "a.sundae", KINDS["no head, degree 3"])
-    opened = []
+    (tmp_path / "fox").mkdir()
+    packed = write_kind(tmp_path / "fox" / "scene.sundae", KINDS["no head, degree 3"])
+    opened, serve_page = [], Mock(side_effect=command.serve)
+    monkeypatch.setattr(command, "serve", serve_page)
     monkeypatch.setattr(webbrowser, "open", opened.append)
     monkeypatch.setattr("http.server.ThreadingHTTPServer.serve_forever", Mock(side_effect=KeyboardInterrupt))
     assert run("view", packed, *([] if opens else ["--no-open-browser"])) == 0
     (line,) = capsys.readouterr().out.strip().splitlines()
+    assert "<title>fox</title>" in serve_page.call_args.args[0]
     assert len(opened) == opens
     assert all(address in line for address in opened)

@@ -42,7 +42,7 @@ def stock(tiny, stock_run, tmp_path_factory):
 @pytest.fixture(scope="module")
 def report(tiny, stock, tmp_path_factory):
     out = tmp_path_factory.mktemp("report")
-    assert run("compare", tiny.folder, stock / "config.yml", "-o", out, "--warmup", 0, "--repeats", 1) == 0
+    assert run("compare", tiny.folder, stock / "config.yml", "-o", out, "--repeats", 1) == 0
     return out
 
 
