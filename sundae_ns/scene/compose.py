@@ -23,7 +23,7 @@ from sundae_ns.pruning.floaters import STRENGTH, floater_odds
 from sundae_ns.scene.prune_scene import weights_in
 from sundae_ns.scene.scene import Scene, unit, usable_cameras, within
 
-HARDLY_SEEN = 0.2  # share below 1% of the mean weight: up to 0.10 in seven captures, in other coordinates from 0.35 on
+HARDLY_SEEN = 0.17  # share below 1% of the mean weight: up to 0.10 in the captures tried, elsewhere from 0.27 on
 OTHERS = "if the cameras are not in the coordinates of the scene, give those of its own run or capture"
 _log = logging.getLogger(__name__)
 
