@@ -208,8 +208,6 @@ def prune_to(
 def summary(report: Mapping[str, Any]) -> str:
     """The report of a prune as one line for the log."""
     line = "step {step}: kept {after:,} of {before:,} Gaussians in {seconds:.1f} s; peak {peak:,}".format(**report)
-    if report["dropped_nonfinite"]:
-        line += f"; {report['dropped_nonfinite']:,} were NaN or infinite"
     if report["sigma"] is not None:
         line += "; sigma {sigma:.3g}, tau {tau:.3g}, {isolated:,} isolated".format(**report)
     return line
@@ -261,6 +259,8 @@ class ScheduledPruning(Callback):
         log.info(summary(report))
         if report["dropped_nonfinite"]:
             log.warning(f"removed {report['dropped_nonfinite']} Gaussians that were not finite")
+        if report["after"] < (config.target_gaussians or 0):
+            log.warning(f"the field has only {report['after']:,} Gaussians; a lower densify-grad-thresh grows more")
         after = run.evaluate() if due and self.evaluate else {}
         for label, results in (("warm-up", before), ("pruned", after)):
             if results:

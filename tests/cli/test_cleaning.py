@@ -55,8 +55,7 @@ def test_export_cuts_a_ply_and_keeps_its_rows(folder, tmp_path, capsys):
     assert f"{int(inside.sum())} of 401 Gaussians are in the box" in said.err
     assert run("export", folder / "a.ply", "-o", tmp_path / "b.ply", "--remove-floaters") == 0
     assert np.array_equal(vertices(tmp_path / "b.ply"), before[1:401])
-    err = capsys.readouterr().err
-    assert "removed 1 floaters of 401 Gaussians, by their neighbours alone" in err
+    assert "removed 1 floaters of 401 Gaussians, by their neighbours alone" in capsys.readouterr().err
 
 
 def test_export_to_a_page_and_to_other_formats(folder, tmp_path):

@@ -331,8 +331,7 @@ def test_levels_of_detail(tmp_path, monkeypatch):
     for path in (tmp_path, tmp_path / "lod-meta.json"):
         found, marks = read_gaussian_file(path)
         assert marks == Marks(True, up=(0.0, 0.6, 0.8), offset=(4e6 + 1 / 3, 0.0, -7.0))
-        apart = torch.cdist(levels[0]["means"], found.gaussians["means"])
-        assert apart.amin(dim=1).max() < 1e-3
+        assert torch.cdist(levels[0]["means"], found.gaussians["means"]).amin(dim=1).max() < 1e-3
         assert found.gaussians.num_gaussians == 150
     (tmp_path / "lod-meta.json").write_text(json.dumps(meta).replace('"0_0', '"../a/0_0'))
     refused(read_gaussian_file, tmp_path, "lies elsewhere")

@@ -136,5 +136,4 @@ def test_a_head_goes_with_its_features(tmp_path):
     for odd in (other, dataclasses.replace(whole, head=None)):
         with pytest.raises(sn.SundaeError, match="one head cannot correct scenes of others; give"):
             sn.merge([whole, odd])
-    without = dataclasses.replace(whole, head=None)
-    assert "features" not in sn.merge([without, scene(1)]).gaussians
+    assert "features" not in sn.merge([dataclasses.replace(whole, head=None), scene(1)]).gaussians

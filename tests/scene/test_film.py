@@ -72,8 +72,7 @@ def test_the_path_leads_through_views_and_closes():
     check_upright(cameras)
     assert turned(cameras, 0, 1) == pytest.approx(2 * math.pi, rel=1e-5), "once around, not to and fro"
     centers = torch.stack([camera.center for camera in cameras])
-    apart = torch.cdist(torch.tensor(eyes), centers).amin(dim=1)
-    assert int((apart < 0.1).sum()) >= 6
+    assert int((torch.cdist(torch.tensor(eyes), centers).amin(dim=1) < 0.1).sum()) >= 6
     assert float(centers.norm(dim=1).min()) > 3.5, "the spline cuts no corner"
 
 

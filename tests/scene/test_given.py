@@ -203,8 +203,7 @@ def test_what_is_refused_in_one_line(name):
 @pytest.mark.usefixtures("short_prunes")
 def test_inference_mode_is_that_of_the_caller():
     with torch.inference_mode():
-        made = sn.Scene.from_points(POINTS, POINTS)
-        assert sn.prune(made, count=50, cameras=CAMERA).num_gaussians == 50
+        assert sn.prune(sn.Scene.from_points(POINTS, POINTS), count=50, cameras=CAMERA).num_gaussians == 50
         assert torch.ones(1).is_inference()
 
 

@@ -53,8 +53,7 @@ def test_every_option_follows_and_once_is_enough(method, share):
         found, value = option(config, name), option(usual, name)
         assert found == (round(share * value) if value else value), name
     for parts in config.optimizers.values():
-        rise = getattr(parts["scheduler"], "warmup_steps", 0)
-        assert rise <= config.max_num_iterations / 12
+        assert getattr(parts["scheduler"], "warmup_steps", 0) <= config.max_num_iterations / 12
     again = deepcopy(config)
     fit_to_length(again, deepcopy(usual), frozenset())
     assert again == config, "as for a run that starts from its saved configuration"
