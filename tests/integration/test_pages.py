@@ -12,6 +12,7 @@ from colmap_models import write_model
 from PIL import Image
 
 from sundae_ns.cli import main
+from sundae_ns.scene.cameras import film_views
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -60,7 +61,8 @@ def commands_of(page, *programs):
 @pytest.mark.parametrize("page", [page for page in PAGES if list(commands_of(page))], ids=lambda page: page.name)
 def test_commands_run_as_they_stand(page, tiny, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sundae_ns.cli.render.SECONDS", 1)
+    brief = lambda *shown, seconds, **rest: film_views(*shown, seconds=1, **rest)  # noqa: E731
+    monkeypatch.setattr("sundae_ns.cli.render.film_views", brief)
     shutil.copytree(tiny.folder, "RUN")
     shutil.copytree(tiny.scene, "CAPTURE")
 
