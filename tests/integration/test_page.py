@@ -232,7 +232,7 @@ def test_the_controls(folder):
 def test_the_page_opens_at_the_start_view_and_turns_about_the_up_axis(folder, tmp_path):
     plain, content = packed_file(folder / "a.sundae")
     second = plain.cameras[1]
-    free = second._replace(viewmat=second.viewmat + 0.05 * torch.eye(4)[[3, 3, 3, 3]])
+    free = second._replace(viewmat=second.viewmat + 0.05 * torch.tensor([[1.0], [1.0], [1.0], [0.0]]) * torch.eye(4)[3])
     shots, x, z = {}, (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
     for name, up, start, stop in (("x", x, second, "2 of 2"), ("z", z, second, "2 of 2"), ("free", z, free, "free")):
         scene = dataclasses.replace(plain, up=up, start=start)
