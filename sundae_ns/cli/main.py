@@ -62,11 +62,10 @@ def _dispatch(words: Sequence[str]) -> int:
     if name not in COMMANDS:
         near = get_close_matches(name, COMMANDS, n=1)
         raise ConfigError(f"there is no command {name}; {f'use {near[0]}' if near else 'sundae --help lists them'}")
-    needs = {os.getcwd: "the working folder is gone; cd to another"}
-    needs[gettempdir] = "no folder for temporary files can be written; make room in /tmp, or set TMPDIR to another"
-    for place, lack in needs.items():  # else libraries fail at their import
-        try:
-            place()
+    no_room = "no folder for temporary files can be written; make room in /tmp, or set TMPDIR to another"
+    for folder_of, lack in ((os.getcwd, "the working folder is gone; cd to another"), (gettempdir, no_room)):
+        try:  # else libraries fail at their import
+            folder_of()
         except FileNotFoundError as error:
             raise ConfigError(lack) from error
     import tyro

@@ -32,7 +32,7 @@ def render(
 ) -> int:
     """Render a scene to an image, or along a path to a video.
 
-    Without --camera, a video is a film along a closed, smooth path through some stored cameras, else around the scene.
+    Without --camera, a video is a film along a closed, smooth path through stored cameras, else where detail is seen.
 
     Args:
         out: image (.png, .jpg or .webp) or video (.mp4) to write.

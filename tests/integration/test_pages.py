@@ -61,8 +61,7 @@ def commands_of(page, *programs):
 @pytest.mark.parametrize("page", [page for page in PAGES if list(commands_of(page))], ids=lambda page: page.name)
 def test_commands_run_as_they_stand(page, tiny, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    brief = lambda *shown, seconds, **rest: film_views(*shown, seconds=1, **rest)  # noqa: E731
-    monkeypatch.setattr("sundae_ns.cli.render.film_views", brief)
+    monkeypatch.setattr("sundae_ns.cli.render.film_views", lambda scene, **_: film_views(scene, seconds=1))
     shutil.copytree(tiny.folder, "RUN")
     shutil.copytree(tiny.scene, "CAPTURE")
 
