@@ -50,7 +50,7 @@ from sundae_ns.train.build import build
 from sundae_ns.train.curve import CurvePoint
 from sundae_ns.train.exposure import ExposureCompensation
 from sundae_ns.train.initialize import Start
-from sundae_ns.train.pruning import FEW_DROPPED, MANY_VIEWS, PruningConfig
+from sundae_ns.train.pruning import DROPPED, FEW_DROPPED, MANY_VIEWS, PruningConfig
 from sundae_ns.train.state import Callback, Photo, TrainingState
 from sundae_ns.train.step import StepInputs, StepLosses, training_part
 from sundae_ns.train.trials import Trials
@@ -74,7 +74,7 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """Term beside SSIM: l1 is the paper's; rms, the root of the mean squared error, gains 0.1 to 0.3 dB."""
     prior_after_prune: float = 0.3  # Weight of opacities and scales in the loss once pruned, over the number of images
     average_share: float = 0.1  # Last share of the schedule over which weights are averaged; 0.1 gains 0.2 dB
-    drop_rate: float | None = None  # Share that steps after the prune leave out; by default 0.2 below 32 photos, else 0
+    drop_rate: float | None = None  # Share that steps after the prune leave out; None: 0.2 of few photos, 0.1 by trials
     exposure_compensation: Literal["auto", "on", "off"] = "auto"
     """Even out photos of changing exposure or white balance with their neighbours; auto does if half of them differ."""
     dense_start_views: int = 300
@@ -213,8 +213,10 @@ class SundaeModel(SplatfactoModel):
         antialiased, absgrad = self.config.rasterize_mode == "antialiased", self.config.use_absgrad
         settings = self.state.render_settings(self.backend, antialiased=antialiased, training=training, absgrad=absgrad)
         few = 0 < self.num_train_data < MANY_VIEWS
-        rate = FEW_DROPPED * few if self.config.drop_rate is None else self.config.drop_rate
-        return replace(settings, drop_rate=rate if training and self.state.pruned else 0.0)
+        usual = FEW_DROPPED if few else DROPPED * self.config.pruning.decides
+        rate = usual if self.config.drop_rate is None else self.config.drop_rate
+        leaves_out = training and self.state.pruned and (few or self.state.step < self.state.averages_from)
+        return replace(settings, drop_rate=rate if leaves_out else 0.0)
 
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> MutableMapping[str, Any]:  # type: ignore[override]
@@ -299,10 +301,8 @@ class SundaeModel(SplatfactoModel):
         """Form of the training images at a step."""
         config, state = self.config, self.state
         rising = config.num_downscales - step // config.resolution_schedule if config.warm_start is None else 0
-        # Densification takes its statistics from whole images.
-        cropped = state.head_enabled and not state.densifying
-        # Mirrored images help in the long run only.
-        mirror = cropped and not state.provisional and config.head.mode != "features"
+        cropped = state.head_enabled and not state.densifying  # densification takes its statistics from whole images
+        mirror = cropped and not state.provisional and config.head.mode != "features"  # helps in the long run only
         return StepResolution(step, int(2 ** max(rising, 0)), config.head.max_train_pixels if cropped else 0, mirror)
 
     def get_training_callbacks(

@@ -88,15 +88,15 @@ def finetune(
             if training.head:
                 model.step = at  # chooses the crop of a large image
             camera, batch = pipeline.datamanager.next_train(at)
-            result = training.step(model.step_inputs(camera, batch), model.render_settings(training=True))
+            settings = replace(model.render_settings(training=True), drop_rate=0.0)
+            result = training.step(model.step_inputs(camera, batch), settings)
             progress(result.loss)
-    source = {**scene.meta.get("source", {}), "finetuned": steps}
     exact = {name: value.detach().cpu() for name, value in training.exact.items()}
     trained = replace(
         scene,
         gaussians={name: exact.get(name, value.detach().cpu()) for name, value in scene.gaussians.items()},
         head={name: exact[name] for name in training.head},
-        meta={**scene.meta, "source": source},
+        meta={**scene.meta, "source": {**scene.meta.get("source", {}), "finetuned": steps}},
     )
     return trained, codecs.to(torch.device("cpu"))
 

@@ -89,6 +89,7 @@ class Averaging(Callback):
     def __init__(self, share: float, settled_at: float) -> None:
         self.share, self.settled_at = share, settled_at
         self._mean = RunningMean()
+        self._end = 0  # Last step of the schedule
         self._restored = 0  # Returns to a snapshot that the field had made when the mean began
         self._replaced: dict[str, Tensor] = {}  # Weights of the last step, from which a longer training goes on
         self._alone = True
@@ -104,18 +105,19 @@ class Averaging(Callback):
 
     def before_training(self, run: TrainingRun) -> None:
         """Put back the weights that a mean has replaced, so that two trainings end as one of their length."""
+        state, length, last = run.state, run.schedule_length, run.last_step
+        if length is not None and last is not None:
+            self._end = max(last, length - 1)  # a part that ends earlier ends with its own weights
+            state.averages_from = max(self._end - self.share * length, self.settled_at - state.offset)
         self._alone = run.images_per_step == 1
         if self._alone:
-            RunningMean(self._replaced, 1).replace(weights_of(run.state))
+            RunningMean(self._replaced, 1).replace(weights_of(state))
         self._replaced = {}
 
     def after_step(self, run: TrainingRun) -> None:
         """Count the weights if their turn has come; after the last step, put the mean in their place."""
-        state, length, last = run.state, run.schedule_length, run.last_step
-        if length is None or last is None:
-            return
-        end = max(last, length - 1)  # a part that ends earlier ends with its own weights
-        if state.schedule_step < self.settled_at or state.step < end - self.share * length:
+        state, last = run.state, run.last_step
+        if state.step < state.averages_from:
             self._mean = RunningMean()  # a run that was stopped in its last part may be resumed for a longer one
             return
         if state.restored != self._restored:
@@ -127,5 +129,5 @@ class Averaging(Callback):
         if replaced:
             log.info(f"step {state.step}: the weights are the mean of {self._mean.count} of the last steps")
             self._replaced = replaced if self._alone else {}
-            if last == end:  # after a part, the mean goes on with the rest of the run
+            if last == self._end:  # after a part, the mean goes on with the rest of the run
                 self._mean = RunningMean()

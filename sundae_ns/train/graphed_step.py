@@ -362,6 +362,6 @@ def _kind(state: TrainingState, inputs: StepInputs, settings: RenderSettings) ->
     degree = min(state.gaussians.sh_degree, settings.active_sh_degree)
     return (
         (camera.width, camera.height, inputs.mask is not None, degree, settings.antialiased, settings.absgrad),
-        (state.densifying, state.pruned, state.head_enabled, settings.fixed_harmonics),
+        (state.densifying, state.pruned, state.head_enabled, settings.fixed_harmonics, settings.drop_rate),
         None if head is None else (head.net, *vars(head.config).values()),
     )

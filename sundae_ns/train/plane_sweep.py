@@ -86,8 +86,7 @@ class Sweep:
         # Normals of planes in camera coordinates, away from it: those that face it or nearly, and the ground's.
         ground = photo.camera.viewmat[:3, :3] @ -normalize(self._up, dim=0)
         for normal in [*photo.camera.K.new_tensor(_TURNED), ground]:
-            # A plane is normal . X = 1 / s, so a pixel has the inverse depth facing * s.
-            facing = rays @ normal
+            facing = rays @ normal  # of a plane normal . X = 1 / s a pixel has the inverse depth facing * s
             steep = facing > STEEPEST * lengths
             if not steep.any():
                 continue

@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 USUAL_SHARE = 0.1  # Share that a prune keeps unless it is told otherwise
 MANY_VIEWS = 32  # With as many, counts are tried, and no length is: captures of 43 training views gain to the end
 FEW_SHARE, USUAL_VIEWS = 0.05, 24  # Least share of the Gaussians that few views keep, and as many keep the usual share
-FEW_DROPPED = 0.2  # Share of the Gaussians that a step on few views leaves out after the prune, against overfitting
+DROPPED, FEW_DROPPED = 0.1, 0.2  # Share of the Gaussians that a step after the prune leaves out; with few views
 NEVER = -1  # Value of state["pruned_at"] before the first prune
 UNPRUNED = {"pruned_at": NEVER, "num_prunes": 0, "peak": 0}  # Running state at the start; the peak is of Gaussians
 COUNT, VIEWS = "count", "views"
@@ -290,8 +290,7 @@ def _warn_if_too_short(run: TrainingRun, pruning: PruningConfig, last_step: int)
     idle = state.head is not None and math.isfinite(starts_at) and last_step + state.offset <= starts_at
     reached = pruned and target is not None and run.source.total <= target
     and_head = ", and the head stays disabled" if idle else ""
-    # The head is enabled in the steps after that one.
-    head_at = int(starts_at) + 1 - state.offset if idle else 0
+    head_at = int(starts_at) + 1 - state.offset if idle else 0  # the head is enabled in the steps after that one
     head_option = "head.start-at" if starts_at != pruning.settled_at else f"pruning.{ends}"
     few, many = f"nothing is pruned{and_head}", f"more Gaussians are left than asked for{and_head}"
     unfinished = prunes and last_step < pruning.last_due and not reached

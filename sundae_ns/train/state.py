@@ -48,6 +48,7 @@ class TrainingState:
     offset: int = 0  # Steps of the schedule that a warm start skips
     densify_until: int = 0  # Step of the schedule at which densification ends
     head_starts_at: float = math.inf  # Step of the schedule after which the head is enabled
+    averages_from: float = math.inf  # Step at which the mean of the weights begins, with which the training ends
     provisional: bool = False  # Whether a trial is trained whose field may be dropped
     restored: int = 0  # Number of times in this process that other weights took the place of the trained ones
     harmonics_every: int = 1  # Steps to one that trains the harmonics beyond the base colours

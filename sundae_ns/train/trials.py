@@ -377,8 +377,7 @@ class Trials(Callback):
         if not self.ended(run):
             return
         if stage == "repeat":
-            # The mean of the last window stays to the end of the schedule.
-            self._mean.replace(weights_of(state))
+            self._mean.replace(weights_of(state))  # the mean of the last window stays to the end of the schedule
             state.restored += 1  # another mean must not contain the weights before it
             self._end_length(run, "paused", progress.chosen["length"])
             log.info(f"step {state.step}: more training would harm other views; the remaining steps change nothing")

@@ -195,7 +195,8 @@ def test_a_training_image_leaves_out_some_and_a_shown_one_none(build):
     assert torch.equal(whole, params["opacities"].sigmoid().squeeze(1))
     assert 0.16 < (dropped == 0).float().mean() < 0.24  # six deviations
     torch.testing.assert_close(dropped[dropped > 0], (whole / 0.8).clamp(max=1)[dropped > 0])
-    model.num_train_data = 32
-    assert model.render_settings(training=True).drop_rate == 0
-    model.config.drop_rate = 0.1
-    assert model.render_settings(training=True).drop_rate == 0.1
+    cases = ((4, 0.1, 0, 0.2), (32, 0.1, 1, 0), (32, None, 0, 0), (32, None, 1, 0.1))
+    for model.num_train_data, model.config.pruning.keep_ratio, model.state.averages_from, rate in cases:
+        assert model.render_settings(training=True).drop_rate == rate
+    model.config.drop_rate = 0.3
+    assert model.render_settings(training=True).drop_rate == 0.3

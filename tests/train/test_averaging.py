@@ -21,9 +21,10 @@ def state(build, monkeypatch):
     return build(n=20).state
 
 
-def train(state, mean, steps, *, last=LAST):
+def train(state, mean, steps, *, last=LAST, images=1):
     """Steps that change the weights at random; the centres at the steps from 90 on that are averaged."""
     seen = []
+    mean.before_training(run_of(state, last=last, images=images))
     for step in steps:
         state.step = step
         torch.manual_seed(step)
@@ -70,6 +71,7 @@ def test_unfinished_schedules_and_growing_fields_keep_their_weights(state):
     for mean, length in ((Averaging(0.1, settled_at=1000), LAST + 1), (Averaging(0.1, settled_at=0), 2 * LAST)):
         state.step = LAST
         before = state.gaussians["means"].detach().clone()
+        mean.before_training(run_of(state, length=length))
         mean.after_step(run_of(state, length=length))
         assert torch.equal(state.gaussians["means"], before)
 
@@ -98,9 +100,7 @@ def test_a_first_part_ends_with_the_mean_of_its_last_steps(state):
 
 
 def test_ranks_do_not_save_the_mean_of_their_shard_which_may_be_empty(state):
-    mean = Averaging(1.0, settled_at=0)
-    mean.before_training(run_of(state, images=2))
-    train(state, mean, range(20))
+    train(state, mean := Averaging(1.0, settled_at=0), range(20), images=2)
     assert not mean.state_dict()
     for value in state.gaussians.values():
         value.data = value.data[:0].clone()
