@@ -93,10 +93,8 @@ def _checked(name: str, check: Callable[[], str | None], remedy: str, purpose: s
     try:
         text = check()
         works, text = bool(text), text or "not found"
-    except metadata.PackageNotFoundError:
-        works, text = False, "not installed"
-    except SundaeError as error:
-        works, text = False, str(error)
+    except (metadata.PackageNotFoundError, SundaeError) as error:
+        works, text = False, str(error) if isinstance(error, SundaeError) else "not installed"
     return Part(name, works, f"{text}, for {purpose}" if purpose else text, remedy)
 
 
@@ -155,7 +153,6 @@ def _kernels() -> str:
 
 
 def _rasterizer() -> str:
-    """The backend that ``auto`` selects."""
     if torch.cuda.is_available():
         return "auto selects gsplat, if its kernels work"
     if (problem := interface.numba_problem()) is not None:

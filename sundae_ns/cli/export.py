@@ -62,10 +62,8 @@ def export(
     (check_file if suffix else check_folder)(out, reads=reads, overwrite=advanced.overwrite)
     if page and upright:
         raise ConfigError("a page turns the scene upright by itself; leave out --upright")
-    if not page and (beside is not None or views):
-        raise ConfigError("only a page shows two scenes or named views; name it .html, or without a suffix")
-    if not page and (advanced.start_view, advanced.up) != (None, None):
-        raise ConfigError(f"{suffix or '.sog'} files hold neither a start view nor an up axis; leave them out")
+    if not page and (beside is not None or views or advanced.start_view is not None):
+        raise ConfigError("only a page shows two scenes, named views or a start view; name it .html, or no suffix")
     before, changes, costs = opened(scene, wishes, advanced, capture=page or lod), wishes.cleans or wishes.reduces, True
     copies, file = before.copies_rows(out), out
     if copies and (upright or not changes):

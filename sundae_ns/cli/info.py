@@ -31,13 +31,12 @@ def info(scene: Scene, cameras: File = None, json: Flag = False) -> int:
     facts |= {"crop": f"--crop {_words(facts['crop'])} holds 99% of what they see"}
     for name, value in facts.items():
         parts = value if isinstance(value, dict) else {}
-        print(f"{name.replace('_', ' '):22}{'' if parts else _words(value)}".rstrip())
-        print("".join(f"  {part:20}{size:,}\n" for part, size in parts.items()), end="")
+        line = f"{name.replace('_', ' '):22}{'' if parts else _words(value)}".rstrip()
+        print(line, *(f"  {part:20}{size:,}" for part, size in parts.items()), sep="\n")
     return 0
 
 
 def _words(value: Any) -> str:
-    """A fact as text."""
     if isinstance(value, list):
         return " ".join(f"{number:.6g}" for number in value)
     if isinstance(value, bool):

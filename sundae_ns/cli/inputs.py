@@ -67,7 +67,7 @@ class Edit(NamedTuple):
             write_bytes(out, self.file)
         elif self.copies_rows(out):
             moved = self.pruned is not None and self.pruned.moved
-            keep_vertices(self.source, out, self.rows, self.stated.gaussians if moved else None)
+            keep_vertices(self.source, out, self.rows, self.stated.gaussians if moved else None, self.scene.up)
         else:
             save(self.stated, out, config=self.form.precision)
 

@@ -12,7 +12,9 @@ import re
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import redirect_stderr
 from difflib import get_close_matches
+from functools import partial, wraps
 from tempfile import gettempdir
 from typing import NoReturn
 
@@ -75,7 +77,17 @@ def _dispatch(words: Sequence[str]) -> int:
         options[at:at] = [] if re.fullmatch(r"-?[\d.]+", "".join(options[at : at + 1])) else ["0.25"]
     # Only the module of this command: some import torch, which takes a second.
     run = getattr(importlib.import_module(f"sundae_ns.cli.{name}"), name)
-    return tyro.cli(run, prog=f"sundae {name}", args=options)
+    said, later = io.StringIO(), wraps(run)(lambda *given, **named: partial(run, *given, **named))
+    try:
+        with redirect_stderr(said):
+            chosen = tyro.cli(later, prog=f"sundae {name}", args=options)
+    except SystemExit as end:
+        if not end.code:  # it was the help
+            raise
+        # Of a box of many lines, those that are not indented further; between its rules are parts.
+        rows = " ".join(re.findall(r"(?m)^[│ ] {1,5}(\S.*?)\.? *│?$", said.getvalue()))
+        raise ConfigError(re.sub(r" [─-]{9,} ", "; ", rows) or said.getvalue()) from end
+    return chosen()
 
 
 def exit_with(command: Callable[[], int], name: str) -> NoReturn:
@@ -115,8 +127,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for name in ("stdout", "stderr"):
             if getattr(sys, name) is None:  # it is closed; else the next file that opens would get its number
                 setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
-        for stream in (sys.stdout, sys.stderr):  # names of files may hold bytes that are no text
-            if isinstance(stream, io.TextIOWrapper):
+            if isinstance(stream := getattr(sys, name), io.TextIOWrapper):  # names of files may be no text
                 stream.reconfigure(errors="backslashreplace")
         # Looking for garbage among the million objects of imports takes a sixth of the start, and 0.6 s of the end.
         gc.set_threshold(100_000)

@@ -49,15 +49,12 @@ def run_command(words: Sequence[str], log: Path | None = None) -> int:
     return code
 
 
-def run_logged(
-    words: Sequence[str], log: Path | None = None, on_line: Callable[[str], object] = lambda line: None
-) -> tuple[int, str]:
+def run_logged(words: Sequence[str], log: Path | None = None, on_line: Callable[[str], Any] = str) -> tuple[int, str]:
     """Run a command without input in its own process group; its exit code, or 128 + n if signal n arrived.
 
     ``log`` takes stdout and stderr in place of the terminal, and is replaced. ``on_line`` is called with each of its
-    lines; the last ones are returned. Ctrl-C, SIGTERM and SIGHUP reach the whole group, once, unless they are ignored,
-    as under nohup; SIGHUP as SIGTERM, so that a training that loses its terminal saves itself. On Linux the command
-    gets SIGTERM if this process dies.
+    lines; the last ones are returned. Ctrl-C, SIGTERM and SIGHUP reach the whole group, once, unless they are ignored;
+    SIGHUP as SIGTERM, so that a training saves itself. On Linux the command gets SIGTERM if this process dies.
     """
     # Programs beside this interpreter come first.
     program = shutil.which(words[0], path=str(Path(sys.executable).parent)) or words[0]

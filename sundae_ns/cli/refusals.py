@@ -31,11 +31,9 @@ def check_folder(
     if outside is not None and _contains(outside, out):
         raise StorageError(f"{out} lies in {outside}, which the command reads; choose another folder")
     _check_writable(out)
-    if not out.exists():
-        return
     if any(_contains(out, path) for path in reads if path is not None):
         raise StorageError(f"{out} holds what the command reads; choose another folder")
-    if not overwrite and any(out.iterdir()):
+    if not overwrite and out.exists() and any(out.iterdir()):
         replaced = "" if overwrite is None else ", or replace its files with --overwrite"
         raise StorageError(f"{out} holds files; choose another folder{replaced}")
 

@@ -60,10 +60,9 @@ def render(
     elif view is None or not views:
         views = [start] if (start := opening(shown).start) is not None else views
     views = [each if width is None else each.zoomed(width / each.width) for each in views]
+    shown = shown.to(fastest_device())
     if video:  # whose colours have half the size
         views = [each._replace(width=each.width // 2 * 2, height=each.height // 2 * 2) for each in views]
-    shown = shown.to(fastest_device())
-    if video:
         speed = fps or speed or 24
         with replacing(out) as partial, progress_bar() as bar:
             images = (image_of(render_view(shown, each).rgb) for each in bar.track(views, description="Rendering"))

@@ -7,7 +7,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 
@@ -25,6 +25,9 @@ _REASONS = {
     errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
     errno.EISDIR: "it is a folder; name a file",
 }
+# What stands in the place of a file that was not fetched, by its first bytes.
+_STAND_INS = {b"version https://git-lfs": "is a pointer of Git LFS; fetch the file itself with `git lfs pull`"}
+_STAND_INS |= dict.fromkeys((b"<!doctype html", b"<html"), "is a web page; download the file that it shows or names")
 
 
 class SundaeError(Exception):
@@ -90,10 +93,13 @@ def reading(
         yield
     except SundaeError:
         raise
-    except OSError as error:
-        raise failure(f"{path} cannot be read ({error.strerror or one_line(error)}); {missing}") from error
     except Exception as error:
-        raise failure(f"{path} is not {kind} ({one_line(error)}); {remedy}") from error
+        said, of_system = getattr(error, "strerror", None) or one_line(error), isinstance(error, OSError)
+        what = f"cannot be read ({said}); {missing}" if of_system else f"is not {kind} ({said}); {remedy}"
+        with suppress(OSError, ValueError), regular(path).open("rb") as file:
+            first = file.read(32).lower()
+            what = next((other for begin, other in _STAND_INS.items() if first.startswith(begin)), what)
+        raise failure(f"{path} {what}") from error
 
 
 def one_line(error: BaseException) -> str:
@@ -114,10 +120,8 @@ def rank_ended(error: BaseException) -> str:
     last = (str(error).strip().splitlines() or [""])[-1]
     if last.startswith(__name__ + "."):
         return f"rank {rank}: {last.partition(': ')[2]}"  # our own errors already name the remedy
-    return (
-        f"rank {rank} ended ({f'killed by {signal}' if signal else last}) and stopped the others; resume from the "
-        "newest checkpoint with --load-dir, on fewer GPUs with a smaller --machine.num-devices"
-    )
+    remedy = "resume from the newest checkpoint with --load-dir, on fewer GPUs with a smaller --machine.num-devices"
+    return f"rank {rank} ended ({f'killed by {signal}' if signal else last}) and stopped the others; {remedy}"
 
 
 def out_of_memory(error: BaseException, primitives: int) -> MemoryExhaustedError:

@@ -59,8 +59,7 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
 
     def mean(name: str) -> Tensor:
         shape = source[name].shape[1:]
-        flat = total(lambda rows: normalized[rows, None] * of(name, rows).flatten(1), shape.numel())
-        return flat.reshape(count, *shape)
+        return total(lambda rows: normalized[rows, None] * of(name, rows).flatten(1), shape.numel()).view(count, *shape)
 
     kept = {name: value[stays] for name, value in source.items()}
     origin = kept["means"].double()
@@ -88,11 +87,10 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
         depth = softplus(of("opacities", rows).squeeze(1), threshold=40.0)
         return depth * mean_projected_area(of("scales", rows).exp())
 
-    merged_depth = total(cover) / mean_projected_area(deviations)
-
     merged = {name: mean(name) for name in source if name not in ("means", "scales", "quats", "opacities")}
     merged |= {"means": origin + shift, "scales": deviations.log(), "quats": quats}
-    depth = merged_depth.clamp(torch.finfo(merged_depth.dtype).tiny, -math.log1p(-MAX_OPACITY))
+    depth = total(cover) / mean_projected_area(deviations)
+    depth = depth.clamp(torch.finfo(depth.dtype).tiny, -math.log1p(-MAX_OPACITY))
     merged["opacities"] = (depth + torch.log(-torch.expm1(-depth)))[:, None]  # logit of 1 - exp(-depth)
     changed = (torch.bincount(group, minlength=count) > 1) & (largest > 0)
     for value in merged.values():

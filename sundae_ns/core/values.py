@@ -21,7 +21,7 @@ def numbers(values: Any, name: str, *shapes: tuple[int, ...]) -> Tensor:
     """Finite numbers of one of the shapes, float64 on the CPU; ``ConfigError`` for anything else."""
     try:
         array = np.asarray(values.detach().cpu().double() if isinstance(values, Tensor) else values)
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError, OverflowError, NotImplementedError):  # the last for tensors without values
         array = np.empty(0)
     if array.shape not in shapes or array.dtype.kind not in "iuf" or not (np.abs(array) < 3e38).all():  # of float32
         wanted = " or ".join(" x ".join(map(str, shape)) or "1" for shape in shapes)

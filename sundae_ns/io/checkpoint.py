@@ -169,9 +169,8 @@ def check_extra_state(state: Mapping[str, Any], num_features: int, encoding: Enc
         ("encoding", encoding, "sh-degree that it was trained with (0 stores logits)"),
     ):
         if extra.get(name) != ours:
-            raise CheckpointError(
-                f"the checkpoint has {name} {extra.get(name)}, the model {ours}; give the --pipeline.model.{hint}"
-            )
+            stated = f"the checkpoint has {name} {extra.get(name)}, the model {ours}"
+            raise CheckpointError(f"{stated}; give the --pipeline.model.{hint}")
     states = (extra.get("running"), extra.get("extensions"))
     if not all(isinstance(state, Mapping) for state in states) or "trained_focal" not in extra:
         raise CheckpointError(_NO_CLOCK)
@@ -180,10 +179,8 @@ def check_extra_state(state: Mapping[str, Any], num_features: int, encoding: Enc
 
 def _check_format(extra: Mapping[str, Any]) -> None:
     if extra.get("format") != FORMAT:
-        raise CheckpointError(
-            f"the checkpoint has format {extra.get('format')}, this version reads {FORMAT}; "
-            "use the version that wrote it"
-        )
+        stated = f"the checkpoint has format {extra.get('format')}, this version reads {FORMAT}"
+        raise CheckpointError(f"{stated}; use the version that wrote it")
 
 
 def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor]) -> None:

@@ -71,9 +71,9 @@ def similarity(params: Mapping[str, Tensor], transform: Tensor, scale: float) ->
 
 
 def _sample(means: Tensor, most: int) -> NDArray[np.float64]:
-    """Up to ``most`` finite centres ``[M, 3]``, evenly from all."""
+    """Up to ``most`` centres ``[M, 3]`` whose squares are in the range of float32, evenly from all."""
     points = means[:: -(-len(means) // most) or 1].double().numpy()
-    return points[np.isfinite(points).all(axis=1)]
+    return points[(np.abs(points) < 1e18).all(axis=1)]
 
 
 def recentred(means: Tensor) -> tuple[Tensor, Direction | None]:

@@ -185,8 +185,6 @@ def write_for_viewers(
     """
     kind = path.suffix.lower()
     gaussians, marks = _prepared(params, kind, marks or Marks(), upright)
-    if kind == ".spz" and marks.offset is not None:
-        _log.warning("%s cannot hold the offset of its coordinates; a .ply, .sog or .glb can", path)
     _WRITERS[kind](path, gaussians, marks)
     return gaussians
 

@@ -77,9 +77,7 @@ def write_glb(path: Path, params: Mapping[str, Tensor], marks: Marks = UNMARKED)
     rest = gaussians["features_rest"].unbind(dim=1)
     attributes |= dict(zip(semantics(sh_degree(gaussians["features_rest"])), rest, strict=True))
     stated = {name: value for name, value in zip(_MARKS, marks, strict=True) if value}
-    accessors: list[dict[str, Any]] = []
-    buffer_views: list[dict[str, int]] = []
-    buffer = bytearray()
+    accessors, buffer_views, buffer = list[dict[str, Any]](), list[dict[str, int]](), bytearray()
     types = {number: name for name, number in _TYPES.items()}
     for name, value in attributes.items():
         data = value.contiguous().numpy().tobytes()  # a multiple of four bytes

@@ -246,7 +246,7 @@ def _bundled(bundle: zipfile.ZipFile, size: int, *, inner: bool = False) -> tupl
     if len(scenes) == 1 and not found and not inner:
         return _bundled(zipfile.ZipFile(io.BytesIO(_zip_entry(bundle, size, "", scenes[0]))), size, inner=True)
     if len(found) != 1:
-        raise ValueError(f"it holds {len(found)} {META} and {len(scenes)} .sog, not one of them")
+        raise ValueError(f"it holds {len(found)} {META} and {len(scenes)} .sog, not one of them; unzip other scenes")
     return partial(_zip_entry, bundle, size, found[0].removesuffix(STREAMED if streamed else META)), streamed
 
 

@@ -71,7 +71,9 @@ def read_splat(path: Path) -> dict[str, Tensor]:
     coordinates. Log-scales of widths of 0 are infinite; see ``gaussians.sanitise``.
     """
     with reading(path, "a complete .splat"):
-        rows = np.frombuffer(regular(path).read_bytes(), _SPLAT)
+        if (content := regular(path).read_bytes()).isascii() and content:
+            raise ValueError("it is text")
+        rows = np.frombuffer(content, _SPLAT)
     quats = (rows["quats"].astype(np.float32) - 128) / 128
     return _gaussians(rows, rows["means"], quats, np.zeros((len(rows), 0, 3)))
 

@@ -16,7 +16,8 @@ table of u8 bytes stored and unpacked; the same parts, a zstd frame each.
 
 The specification asks for right-up-back axes, but its own converter from .ply does not rotate, nor do ``gsply`` and
 ``splat-transform`` (nianticlabs/spz, issue 84). So a .ply and a .spz show the same scene, unless the file states its
-axes (extension ADBE0003): these are turned to those of a .ply, right-down-front.
+axes (extension ADBE0003): these are turned to those of a .ply, right-down-front. Up and an offset, which have no field,
+stand in the comment of the gzip stream, as in a .ply.
 """
 
 from __future__ import annotations
@@ -36,11 +37,12 @@ from sundae_ns.core.files import replacing
 from sundae_ns.core.gaussians import SPLAT_NAMES
 from sundae_ns.io.budget import afford_gaussians, read_exactly
 from sundae_ns.io.coordinates import similarity
-from sundae_ns.io.ply import LEAST_OPACITY, UNMARKED, Marks, checked, from_smallest_three
+from sundae_ns.io.ply import LEAST_OPACITY, UNMARKED, Marks, checked, comments_of, from_smallest_three, marks_in
 
 _AXES = ("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF", "LBD", "RBD", "LBU", "RBU", "LFD", "RFD", "LFU", "RFU")
 _OPPOSITE = dict(zip("LRDUBF", "RLUDFB", strict=True))
 _COORDINATE_SYSTEM = 0xADBE0003
+_COMMENTED = b"\x1f\x8b\x08\x10"  # the begin of a gzip stream with a comment
 _HARMONICS_STEP = 1 / 64  # costs 0.03 dB; twice this step costs 0.12 dB (docs/formats.md)
 _HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, reserved
 
@@ -66,20 +68,22 @@ def write_spz(path: Path, params: Mapping[str, Tensor], marks: Marks = UNMARKED)
     bits = fractional_bits(gaussians["means"])
     gaussians["features_rest"] = (gaussians["features_rest"] / _HARMONICS_STEP).round() * _HARMONICS_STEP
     means, scales, quats, colors, rest, opacities = (gaussians[name].numpy() for name in SPLAT_NAMES)
-    harmonics = rest if rest.size else None
-    data = GSData.from_arrays(means, scales, quats, opacities[:, 0], colors, harmonics, format="ply")
+    data = GSData.from_arrays(means, scales, quats, opacities[:, 0], colors, rest if rest.size else None, format="ply")
     with replacing(path) as partial:
         write(partial, data, version=3, fractional_bits=bits)  # more programs read version 3 than 4
         # gsply 0.4 has no option for the flag of antialiasing, in byte 14.
         raw = bytearray(gzip.decompress(partial.read_bytes()))
         raw[14] |= marks.antialiased
-        partial.write_bytes(gzip.compress(bytes(raw), mtime=0))
+        packed, stated = gzip.compress(bytes(raw), mtime=0), "\n".join(comments_of(marks)).encode()
+        partial.write_bytes(_COMMENTED + packed[4:10] + stated + b"\0" + packed[10:])
 
 
 def read_spz(path: Path) -> tuple[dict[str, Tensor], Marks]:
-    """Read a .spz of version 1 to 4: Gaussians as of ``ply.read_ply``, and whether they are marked as antialiased."""
+    """Read a .spz of version 1 to 4: Gaussians as of ``ply.read_ply``, and what it states of them."""
     with reading(path, "a complete .spz"):
-        return decoded(regular(path).read_bytes(), "RDF")
+        params, marks = decoded(content := regular(path).read_bytes(), "RDF")
+        comment = content[10 : content.find(b"\0", 10, 200)] if content.startswith(_COMMENTED) else b""
+        return params, marks_in(comment.decode("latin-1").splitlines())._replace(antialiased=marks.antialiased)
 
 
 def decoded(content: bytes, axes: str) -> tuple[dict[str, Tensor], Marks]:

@@ -105,7 +105,10 @@ def test_prune_keeps_a_share_of_what_remains(folder, tmp_path, capsys):
     words = ("--redistribution", "none", "--score", "response", "--selection", "band")
     assert run("prune", folder / "a.ply", "-o", tmp_path / "d.ply", "--keep", 0.25, *words) == 0
     whole = PlyData.read(tmp_path / "d.ply")
-    assert (whole.comments, whole["extra"].data["number"].tolist()) == (["by another program"], [7])
+    assert (whole.comments, whole["extra"].data["number"].tolist()) == (
+        ["by another program", "Vertical axis: 0 -1 0"],
+        [7],
+    )
     assert len(kept := whole["vertex"].data) == 100
     assert np.array_equal(kept, before[kept["mine"].astype(int)]), "kept rows do not change"
     out = tmp_path / "c.sundae"

@@ -99,8 +99,7 @@ def aligned(quats: Floats, scales: Floats) -> tuple[Floats, Floats]:
     w, x, y, z = torch.from_numpy(quats).double().T.numpy()
     products = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     best = np.abs(np.einsum("cn,gc->gn", products[0], turns)).argmax(axis=0)
-    turned = np.einsum("rcn,nc->nr", products, turns[best])
-    turned = _normalized(torch.from_numpy(turned)).numpy()
+    turned = _normalized(torch.from_numpy(np.einsum("rcn,nc->nr", products, turns[best]))).numpy()
     # A turn puts the axis in which it has a column's 1 into that column's place.
     places = rotation_matrices(torch.from_numpy(turns)).abs().numpy().argmax(axis=1)
     return turned.astype(np.float32), np.take_along_axis(scales, places[best], axis=1)
@@ -467,10 +466,7 @@ def estimated_bits(codecs: Codecs, gaussians: Mapping[str, Tensor], head: Mappin
     coder's contexts know the magnitude nearby, so m is measured in runs along the curve. The codecs are on the device
     of the Gaussians, which are in their order.
     """
-    bits = {}
-    for name, codec in codecs.gaussians.items():
-        values = gaussians[name]
-        bits[name] = _of_rows(codec.coefficients(values.reshape(len(values), -1)))
+    bits = {name: _of_rows(codec.coefficients(gaussians[name].flatten(1))) for name, codec in codecs.gaussians.items()}
     if codecs.head is not None and head:
         levels = [codecs.head.coefficients(name, value) for name, value in head.items() if value.ndim > 1]
         bits["head"] = torch.stack([_of_magnitudes(level.abs().mean(dim=1), level.shape[1]) for level in levels]).sum()

@@ -117,11 +117,9 @@ def fault(value: Any, schema: Mapping[str, Any], prefix: str = "") -> str | None
     Whole numbers may be written as ``3.0``, which JavaScript does not tell from ``3``.
     """
     # The first error only: own keywords come last in a schema, and rely on those before.
-    error = next(_Validator(schema).iter_errors(value), None)
-    if error is None:
+    if (error := next(_Validator(schema).iter_errors(value), None)) is None:
         return None
-    keys = [prefix] if prefix else []
-    keys += map(str, error.absolute_path)
+    keys = [*filter(None, [prefix]), *map(str, error.absolute_path)]
     if error.validator == "required":
         keys.append(next(key for key in error.validator_value if key not in error.instance))
     return ".".join(keys)
@@ -199,8 +197,7 @@ def encode(meta: Mapping[str, Any], arrays: Mapping[str, Array], *, unpacked: in
     parts = {name: [_deflated(plane) for plane in split_planes(array)] for name, array in little.items()}
     body = sum(len(part) for planes in parts.values() for part in planes)
     size = max(unpacked, sum(array.nbytes for array in little.values()))
-    lacking = (size - SPARE) // MAX_RATIO + 1 - body
-    if lacking > 0:
+    if (lacking := (size - SPARE) // MAX_RATIO + 1 - body) > 0:
         little[PADDING] = np.zeros(lacking, np.uint8)
         parts[PADDING] = [little[PADDING].tobytes()]
     stored = {name: b"".join(planes) for name, planes in parts.items()}

@@ -79,8 +79,7 @@ class PackReport(NamedTuple):
 
 def _check(params: Mapping[str, Tensor]) -> None:
     check_gaussians(params, PackError)
-    n = num_gaussians(params)
-    if n == 0:
+    if (n := num_gaussians(params)) == 0:
         raise PackError("the scene has no Gaussians; there is nothing to pack")
     shape = params[FEATURES].shape if FEATURES in params else (n, 1)
     if len(shape) != 2 or shape[0] != n or not 1 <= shape[1] <= _MAX_WIDTH:
@@ -177,8 +176,7 @@ def _array(file: _Sections, attribute: str, part: str, **lengths: int) -> Array:
     """A section in the dtype, shape and range that the format states; ``lengths`` are sides that it names."""
     codec = attribute if attribute == "cameras" else _about(file, attribute)["codec"]
     section, name = FORMAT["sections"][codec][part], f"{attribute}/{part}"
-    array = file.arrays.get(name)
-    if array is None or not fits(array, section, lengths):
+    if (array := file.arrays.get(name)) is None or not fits(array, section, lengths):
         raise ValueError(f"{name} is missing or has another shape")
     if not in_range(array, section):
         raise ValueError(f"{name} has values that are not finite or out of range")
