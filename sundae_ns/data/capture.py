@@ -45,8 +45,7 @@ def matrix(value: Any, rows: Sequence[int], name: str, where: str) -> np.ndarray
         raise DataError(f"{where}: {name} must have {' or '.join(map(str, rows))} rows of 4 numbers")
     for entry in chain(*value):
         finite(entry, name, where)
-    array = np.array(value, dtype=np.float64)
-    if abs(np.linalg.det(array[:3, :3])) < 1e-9:
+    if abs(np.linalg.det((array := np.array(value, dtype=np.float64))[:3, :3])) < 1e-9:
         raise DataError(f"{where}: {name} is singular, so it is not a camera pose; remove this view")
     return array
 
@@ -66,7 +65,7 @@ def read_json(path: Path) -> dict[str, Any]:
     with reading(path, "JSON", remedy="write it again"):
         if regular(path).stat().st_size > 32_000_000:  # that of 30,000 images
             raise DataError(f"{path} has more than 32 MB; split it")
-        content = json.loads(path.read_bytes())
+        content = json.loads(path.read_bytes().replace(rb"\\", b"/"))  # paths of Windows
     if not isinstance(content, dict):
         raise DataError(f"{path} does not hold a JSON object; give the transforms.json of a capture")
     return content

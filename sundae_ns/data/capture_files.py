@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from PIL import Image
+from PIL.Image import Resampling
 
 from sundae_ns.core.camera import OPENGL_TO_OPENCV
 from sundae_ns.core.errors import DataError, writing
@@ -27,7 +27,7 @@ ARCHIVE = Path(__file__).with_name("demo_capture.zip")  # ray-traced: 48 trainin
 CLOUD = "sparse_pc.ply"
 # From COLMAP's coordinates, whose y points down in most captures, to those of the capture, whose z points up.
 APPLIED = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0]])
-_NEAREST = Image.Resampling.NEAREST
+Advance = Callable[[int], None]  # called with the number of further parts of a stage that are done
 
 
 class Placed(NamedTuple):
@@ -80,7 +80,7 @@ def names_of(photos: Sequence[Photo]) -> list[str]:
 
 
 def write_images(
-    photos: Sequence[Photo], folder: Path, warn: Callable[[str], object], advance: Callable[[int], None]
+    photos: Sequence[Photo], folder: Path, warn: Callable[[str], Any], advance: Advance
 ) -> dict[str, Photo]:
     """Write the photos, upright and in sRGB, unless their images exist; those :func:`.usable`, by their images."""
 
@@ -104,7 +104,7 @@ def write_images(
     return dict(usable(list(zip(names_of(photos), photos, strict=True)), write, warn))
 
 
-def write_smaller(images: Path, advance: Callable[[int], None] = lambda _: None, *, masks: bool = False) -> None:
+def write_smaller(images: Path, advance: Advance = lambda _: None, *, masks: bool = False) -> None:
     """Write ``images_2``, ``images_4``, ``images_8`` beside a folder, and more until one has 1,600 pixels at most."""
     # Odd sizes are rounded down, as nerfstudio rounds those of cameras. Masks get no new values.
     paths = sorted(images.iterdir())
@@ -116,17 +116,12 @@ def write_smaller(images: Path, advance: Callable[[int], None] = lambda _: None,
         for factor in factors:
             (folder := images.with_name(f"{images.name}_{factor}")).mkdir(exist_ok=True)
             size = max(1, image.width // factor), max(1, image.height // factor)
-            image.resize(size, _NEAREST if masks else Image.Resampling.BOX).save(folder / path.name, **JPEG)
+            image.resize(size, Resampling.NEAREST if masks else Resampling.BOX).save(folder / path.name, **JPEG)
         advance(1)
 
 
 def write_capture(
-    out: Path,
-    model: Any,
-    images: Path,
-    sources: Mapping[str, str],
-    masks: Mapping[str, Path],
-    advance: Callable[[int], None],
+    out: Path, model: Any, images: Path, sources: Mapping[str, str], masks: Mapping[str, Path], advance: Advance
 ) -> None:
     """Write a capture into a folder, which is replaced, of a ``pycolmap.Reconstruction`` of the ``images`` of a folder.
 
@@ -143,7 +138,7 @@ def write_capture(
         except OSError:  # a disk without hard links
             shutil.copyfile(source, target)
         if masks:
-            mask = decoded_mask(masks[name]).resize(check_image(source), _NEAREST)
+            mask = decoded_mask(masks[name]).resize(check_image(source), Resampling.NEAREST)
             mask.save(out / "masks" / f"{target.stem}.png")
     write_smaller(out / "images", advance)
     if masks:

@@ -118,8 +118,7 @@ def read_points(model: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
 
 def check_colmap(model: Path, images: Path | None, *, points: bool = True) -> None:
     """Check the files of a COLMAP model, and its images, if their folder is given, whose paths reach a shell."""
-    names = [image.name for image in read_images(model).values()]
-    if len(names) < 2:
+    if len(names := [image.name for image in read_images(model).values()]) < 2:
         raise DataError(f"{model} has {len(names)} image; training needs 2 or more")
     if hostile := next((name for name in [str(images or ""), *names] if set(name) & set('"$`\\\n')), None):
         raise DataError(f"{hostile!r} has quotes, $, ` or backslashes in its name; rename it without them")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import filecmp
+import importlib
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -49,8 +50,7 @@ def find_photos(folder: Path, warn: Callable[[str], object] = str) -> list[Photo
     with reading(folder, "a folder of photos"):
         suffixes = [suffix for suffix in SUFFIXES if suffix not in HEIF or reads_heif()]
         paths = sorted(path for path in _files(folder) if path.suffix.lower() in suffixes)
-    counts = Counter(path.parent for path in paths)
-    if len(counts) > 1 and folder not in counts:
+    if len(counts := Counter(path.parent for path in paths)) > 1 and folder not in counts:
         listed = ", ".join(f"{path.relative_to(folder)}: {count:,}" for path, count in list(counts.items())[:3])
         where = f"{folder} holds {len(paths):,} photos in {len(counts)} folders ({listed}{', ...' * (len(counts) > 3)})"
         raise DataError(f"{where}; give the folder of one scene, or move its photos into one folder")
@@ -61,8 +61,11 @@ def find_photos(folder: Path, warn: Callable[[str], object] = str) -> list[Photo
         few = f"{len(paths)} photo{'s' * (len(paths) > 1)}"
         raise DataError(f"{folder} holds {few}, and camera poses need {LEAST_PHOTOS} or more that overlap; add some")
     photos = list(usable(paths, photo_of, warn))
-    for copy, first in copies(photo.path for photo in photos).items():
-        warn(f"{copy} is a copy of {first}; remove one, as it may become a test view while the other is trained on")
+    named = {path.with_suffix(""): path for path in reversed(paths)}  # RAW files and HEIC lie beside their JPEG
+    twins = copies(photo.path for photo in photos)
+    twins |= {path: first for path in paths if (first := named[path.with_suffix("")]) != path}
+    for copy, first in [*twins.items()][:1]:
+        warn(f"{copy} and {first} seem to be one photo ({len(twins)} pairs); remove one, or test views are trained on")
     return photos
 
 
@@ -120,9 +123,7 @@ def upright(photo: Photo) -> tuple[Image.Image, Image.Exif]:
 
 
 def _raw(path: Path) -> Any:
-    import rawpy  # comes with nerfstudio
-
-    return rawpy.imread(str(regular(path)))
+    return importlib.import_module("rawpy").imread(str(regular(path)))  # comes with nerfstudio
 
 
 def _files(folder: Path) -> Iterator[Path]:

@@ -21,14 +21,13 @@ import numpy as np
 
 from sundae_ns.core.errors import ConfigError, DataError, writing
 from sundae_ns.core.files import flush, write_text
-from sundae_ns.data.capture_files import TRANSFORMS, Placed, placed_in, write_capture, write_images
+from sundae_ns.data.capture_files import TRANSFORMS, Advance, Placed, placed_in, write_capture, write_images
 from sundae_ns.data.layouts import LONGEST_SIDE
 from sundae_ns.data.photos import find_photos, masks_of
 from sundae_ns.data.video import is_video, write_frames
 from sundae_ns.io.run_folder import reserve
 
 Matching = Literal["auto", "exhaustive", "sequential", "similar"]
-Advance = Callable[[int], None]  # called with the number of further parts of a stage that are done
 Reporter = Callable[[str, int], AbstractContextManager[Advance]]  # a stage by its name and its number of parts
 INSTALL = 'pip install "sundae_ns[photos]"'
 _MOST_EXHAUSTIVE = 200  # photos up to which all pairs are compared: 19,900 pairs

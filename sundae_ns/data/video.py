@@ -26,6 +26,8 @@ _CONVERT = "convert it to .mp4 (H.264)"
 # Numbers of ITU-T H.273: matrices of BT.709, FCC, BT.601 (twice), 240M, BT.2020; of RGB or unknown; transfers refused.
 _MATRICES, _UNSTATED = (1, 4, 5, 6, 7, 9), (0, 2, 3)
 _NOT_SHOWN = {8: "linear", 9: "logarithmic", 10: "logarithmic", 17: "cinema (SMPTE 428)"}
+_NO_VIEWS = dict.fromkeys([f"SPHERICAL {n}" for n in (0, 1, 2, 3, 5)], "is a panorama; export flat views of it")
+_NO_VIEWS |= dict.fromkeys([f"STEREO3D {n}" for n in (1, 2, 4, 5, 6, 7)], "has two eyes in each frame; export one eye")
 _DOLBY = ("dvh1", "dvhe", "dva1", "dvav")  # Without a stated transfer (profile 5) their colours are of no standard
 
 
@@ -76,6 +78,8 @@ def image_of(frame: Any, path: Path, aspect: float = 1.0) -> Image.Image:
     if transfer in HIGH_RANGE:
         pixels = to_srgb_values(pixels, transfer, int(frame.color_primaries))
     for data in frame.side_data:
+        if (shape := f"{data.type.name} {next(iter(bytes(data)), '')}") in _NO_VIEWS:
+            raise DataError(f"{path} {_NO_VIEWS[shape]}")
         if data.type.name == "DISPLAYMATRIX":  # of points (x, y) as rows, in 65536ths
             a, b, _, c, d = np.sign(np.round(np.frombuffer(bytes(data), np.int32)[:5] / 65536)).astype(int)
             if (a == 0) != (b == 0) and abs(a + c) == abs(b + d) == 1:  # a right angle
@@ -117,7 +121,7 @@ def _frames(path: Path) -> Iterator[Any]:
         for packet in container.demux(video):
             frames = []
             with suppress(av.error.InvalidDataError):  # the packet is damaged
-                frames = packet.decode()
+                frames = [frame for frame in packet.decode() if not frame.is_corrupt]
             for frame in frames:
                 if graph is None and frame.interlaced_frame:
                     graph = av.filter.Graph()
@@ -129,10 +133,10 @@ def _frames(path: Path) -> Iterator[Any]:
 
 
 def _facts(path: Path) -> tuple[int, float]:
-    """Number of frames, as the file states or counted; and width of a pixel as a share of its height."""
+    """Number of frames, which files state wrongly; and width of a pixel as a share of its height."""
     with _opened(path) as (container, video):
         aspect = float(video.sample_aspect_ratio or 1)
-        length = video.frames or sum(packet.size > 0 for packet in container.demux(video))
+        length = sum(packet.size > 0 for packet in container.demux(video))
     return length, aspect if 0.5 <= aspect <= 2 else 1.0  # no format of videos uses others
 
 

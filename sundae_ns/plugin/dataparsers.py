@@ -235,6 +235,8 @@ class LightNerfstudioParser(_PosedParser, Nerfstudio):
         frames = meta["frames"]
         for frame in frames:
             name = self._get_fname(Path(frame["file_path"]), folder)
+            if name in self.lenses:  # smaller images lie in one folder
+                raise DataError(f"{path.name} has two frames with the image {name}; remove one, or name images apart")
             self.lenses[name] = lens_of(meta, frame, path.name)
             frame.update({**{key: meta[key] for key in INTRINSICS if key in meta}, **frame})
         for entries in (meta, *frames):

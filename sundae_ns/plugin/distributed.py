@@ -66,8 +66,7 @@ def forward_signals() -> None:
     """Pass SIGINT and SIGTERM on to the ranks, which save and leave together, and wait for them."""
 
     def forward(number: int, frame: FrameType | None) -> None:
-        ranks = multiprocessing.active_children()
-        if not ranks:
+        if not (ranks := multiprocessing.active_children()):
             print(f"\n{NOTHING_SAVED}", file=sys.stderr)
             raise SystemExit(128 + number)
         passed_on.append(number)

@@ -305,8 +305,7 @@ class SundaeTrainer(Trainer):
                     other.unlink(missing_ok=True)
 
     def _load_checkpoint(self) -> None:
-        path = self._source()
-        if path is None:
+        if (path := self._source()) is None:
             return
         loaded = checkpoint.read(path)
         remedy = "load it with the options that it was trained with"

@@ -167,6 +167,14 @@ def with_profile(mode, space):
     return lambda path: patches().convert(mode).save(path, icc_profile=icc)
 
 
+def bitmap(path):
+    """A BMP of version 5 with a profile behind its pixels, which Pillow does not write."""
+    pixels, icc = SAME[::-1, :, ::-1].astype(np.uint8).tobytes(), profile("P3")
+    head = struct.pack("<I2i2H6I4I", 124, 192, 128, 1, 24, 0, len(pixels), 0, 0, 0, 0, 255 << 16, 255 << 8, 255, 0)
+    head += b"DEBM".ljust(52, b"\0") + struct.pack("<4I", 4, 124 + len(pixels), len(icc), 0)
+    path.write_bytes(struct.pack("<2s3I", b"BM", 138 + len(pixels) + len(icc), 0, 138) + head + pixels + icc)
+
+
 GREY = np.asarray(patches().convert("L").convert("RGB"), int)
 PLANES, RED = 257 * SAME.transpose(2, 0, 1).astype(np.uint16), SAME[..., :1].repeat(3, axis=-1)
 TYPES = {
@@ -182,6 +190,7 @@ TYPES = {
     "grey in P3": (with_profile("L", "ProPhoto"), "RGB", judged(Image.fromarray(GREY.astype(np.uint8)), "ProPhoto")),
     "alpha and a profile": (with_profile("RGBA", "P3"), "RGBA", judged(patches(), "P3")),
     "a profile of another kind": (with_profile("RGB", "grey"), "RGB", SAME),
+    "a profile of BMP": (bitmap, "RGB", judged(patches(), "P3")),
     "a damaged profile": (with_profile("RGB", b"none"), "RGB", SAME),
 }
 

@@ -26,12 +26,12 @@ def patches(width=192, height=64):
 
 def write_colours(path, images, matrix=2, full=False, *, pixels="yuv420p", codec="libx264", turn=None, **marks):
     """Write a video of images, which are converted and marked by a matrix, a range and a transfer."""
-    with av.open(str(path), "w") as container:
+    with av.open(str(path), "w", options=marks.get("options", {})) as container:
         container.metadata["title"] = marks.get("title", "")
         video = container.add_stream(codec, rate=10)
         video.height, video.width = images[0].shape[:2]
         video.pix_fmt = pixels
-        video.options = {"crf": "1", "x265-params": "log-level=0:crf=1"}
+        video.options = {"crf": "1", "x265-params": "log-level=0:crf=1", "x264-params": marks.get("x264", "")}
         coder = video.codec_context
         coder.colorspace, coder.color_range, coder.color_trc = matrix, 1 + full, marks.get("transfer", 2)
         coder.flags |= marks.get("flags", 0)
@@ -144,10 +144,23 @@ def test_the_sharpest_frame_of_each_stretch(tmp_path):
     assert left[:13] == [1 + 3 * number for number in range(13)]
 
 
-@pytest.mark.parametrize("name", ["a.mkv", "a.mts", "a.ts", "a.flv", "\udcff.mp4"])
-def test_frames_are_counted_where_no_length_is_stated(tmp_path, name):
-    write_colours(tmp_path / name, 5 * [patches()], 1)
+@pytest.mark.parametrize("name", ["a.mkv", "a.mts", "a.ts", "a.flv", "\udcff.mp4", "parts.mp4"])
+def test_frames_are_counted_where_no_length_is_stated_or_that_of_a_part(tmp_path, name):
+    parts = {"movflags": "frag_keyframe+default_base_moof"} if name == "parts.mp4" else {}
+    write_colours(tmp_path / name, 5 * [patches()], 1, options=parts, x264="keyint=2")
     assert _facts(tmp_path / name) == (5, 1)
+    assert len(frames_from(tmp_path / name)) == 5
+
+
+def test_frames_with_missing_parts_are_left_out(tmp_path):
+    path = tmp_path / "a.avi"
+    noise = np.random.default_rng(0).integers(0, 256, (64, 192, 3), np.uint8)
+    write_colours(path, [np.roll(noise, 9 * i, axis=1) for i in range(12)], codec="mpeg4")
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2] + bytes(60) + content[len(content) // 2 + 60 :])
+    with av.open(str(path)) as container:
+        whole = [not frame.is_corrupt for frame in container.decode(video=0)]
+    assert len(frames_from(path)) == sum(whole) < len(whole)
 
 
 def test_all_frames_of_a_short_video_are_there_only_once_they_are_whole(tmp_path):
@@ -202,6 +215,22 @@ def playlist(text):
     return make
 
 
+def panorama(path):
+    """An .mp4 whose track states a sphere, as cameras of 360 degrees write it (Google's Spherical Video V1)."""
+    write_colours(path, 5 * [patches()], 1)
+    content, tag = bytearray(path.read_bytes()), "<GSpherical:{0}>{1}</GSpherical:{0}>"
+    words = {"Spherical": "true", "Stitched": "true", "StitchingSoftware": "x", "ProjectionType": "equirectangular"}
+    text = bytes.fromhex("ffcc8263f8554a938814587a02521fdd")
+    text += "".join(tag.format(*item) for item in {"SphericalVideo": "", **words}.items()).encode()
+    ends = []
+    for name in (b"moov", b"trak"):
+        start = content.index(name) - 4
+        (size,) = struct.unpack_from(">I", content, start)
+        struct.pack_into(">I", content, start, size + 8 + len(text))
+        ends.append(start + size)
+    path.write_bytes(content[: ends[1]] + struct.pack(">I", 8 + len(text)) + b"uuid" + text + content[ends[1] :])
+
+
 UNREADABLE = "is not a video that FFmpeg decodes .*; convert it to .mp4"
 REFUSED = {
     "text": (lambda path: path.write_text("not a video"), UNREADABLE),
@@ -215,6 +244,11 @@ REFUSED = {
     "HLS": (playlist("#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nfile://{}\n#EXT-X-ENDLIST\n"), UNREADABLE),
     "ffconcat": (playlist("ffconcat version 1.0\nfile other.mp4\nfile other.mp4\n"), UNREADABLE),
     "SDP": (playlist("v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=x\r\nm=video 9 RTP/AVP 96\r\n"), UNREADABLE),
+    "a panorama": (panorama, "is a panorama; export flat views"),
+    "two eyes": (
+        lambda path: write_colours(path, 5 * [patches()], x264="frame-packing=3"),
+        "has two eyes in each frame",
+    ),
     "linear light": (lambda path: write_colours(path, 5 * [patches()], 1, transfer=8), "has linear light"),
     "Dolby Vision 5": (
         lambda path: write_colours(path, 5 * [patches()], pixels="yuv420p10le", codec="libx265", tag="dvh1"),

@@ -119,6 +119,7 @@ REFUSED = {
     "half a pixel": ({"h": 16.5}, "h is 16.5"),
     "no frames": ({"frames": []}, "lists 0 images; training needs 2"),
     "one frame": ({"frames": lambda frames: frames[:1]}, "lists 1 image; training needs 2"),
+    "an image twice": ({"frames": lambda frames: [*frames, frames[1]]}, r"two frames with the image .*2\.png; remove"),
     "frames that are numbers": ({"frames": [1, 2]}, "frame 0"),
     "an unknown camera": ({"camera_model": "BRAIN"}, "camera_model is 'BRAIN'; use one of SIMPLE_PINHOLE"),
     "a round lens without a radius": (ROUND, "fisheye_crop_radius is None; .*a positive number"),
@@ -319,12 +320,18 @@ def _masked(data):
     rewrite(data, {"frames": masked("masks/half.png")})
 
 
+def _of_windows(data):
+    path = data / "transforms.json"
+    path.write_text(path.read_text().replace("images/", r"images\\"))
+
+
 FINE = {
     "unchanged": lambda data: None,
     **{mode: _each_image(lambda image, mode=mode: image.convert(mode)) for mode in ("1", "L", "LA", "P", "RGBA")},
     "one pixel": _one_pixel,
     "masks": _masked,
     "unicode and spaces in names": _renamed,
+    "paths of Windows": _of_windows,
     "a mark of UTF-8": lambda data: rewrite(data, {"skew": 0.0}, b"\xef\xbb\xbf"),
     "no points": lambda data: rewrite(data, {"ply_file_path": GONE}),
 }
