@@ -112,8 +112,7 @@ def out_of_budget(lines, budgets):
 
 
 def test_every_room_has_a_floor_and_keeps_its_budget():
-    rooms = {room for module in modules() if (room := room_of(module)) is not None}
-    assert rooms == FLOORS.keys()
+    assert {room for module in modules() if (room := room_of(module)) is not None} == FLOORS.keys()
     assert {path.name for path in (ROOT / PACKAGE).glob("*.py")} == {"__init__.py"}
     with BUDGETS.open() as file:
         budgets = {row["room"]: int(row["lines"]) for row in csv.DictReader(file)}

@@ -96,8 +96,7 @@ def test_a_film_without_a_camera_path(folder, tmp_path, capsys, name):
 
 def test_an_image_is_that_of_the_start_view(folder, tmp_path):
     scene = sn.load(folder / "packed.sundae")
-    start = scene.cameras[1].zoomed(2)
-    sn.save(dataclasses.replace(scene, start=start), tmp_path / "a.sundae")
+    sn.save(dataclasses.replace(scene, start=scene.cameras[1].zoomed(2)), tmp_path / "a.sundae")
     assert run(tmp_path / "a.sundae", "-o", tmp_path / "a.png") == 0
     assert pixels(tmp_path / "a.png").shape == (62, 82, 3)
     assert run(tmp_path / "a.sundae", "-o", tmp_path / "b.png", "--view", 0) == 0

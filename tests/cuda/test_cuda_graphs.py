@@ -22,8 +22,7 @@ def test_a_key_repeated_in_a_row_is_recorded_once():
 
     for key in "abababab":
         assert get(key) is None
-    found = [get("a") for _ in range(RECORD_AT + 2)]
-    assert found == [None] * (RECORD_AT - 1) + ["graph of a"] * 3
+    assert [get("a") for _ in range(RECORD_AT + 2)] == [None] * (RECORD_AT - 1) + ["graph of a"] * 3
     assert get("b") is None
     assert get("a") == "graph of a"
     assert made == ["a"]

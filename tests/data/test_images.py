@@ -35,8 +35,7 @@ def patches(width=192, height=128):
 def off(image, expected):
     """The largest difference in the middle of the fields; JPEG and HEIC change what lies at their edges."""
     middles = np.abs(np.arange(192) % 24 - 11.5) < 4, np.abs(np.arange(128) % 16 - 7.5) < 4
-    difference = np.abs(np.asarray(image.convert("RGB"), int) - expected)
-    return int(difference[middles[1]][:, middles[0]].max())
+    return int(np.abs(np.asarray(image.convert("RGB"), int) - expected)[middles[1]][:, middles[0]].max())
 
 
 KINDS = {

@@ -45,12 +45,10 @@ def test_a_model_and_its_images(tmp_path, place, images, words):
 
 @pytest.mark.parametrize(("made", "factor"), [([], 1), ([4], 1), ([2], 2), ([2, 4, 8], 4)])
 def test_smaller_images_are_taken_where_there_are_some(tmp_path, made, factor):
-    names = photos(tmp_path / "images", 3, (6000, 40))
-    write_model(tmp_path / "sparse" / "0", names, (6000, 40))
+    write_model(tmp_path / "sparse" / "0", photos(tmp_path / "images", 3, (6000, 40)), (6000, 40))
     for one in made:
         photos(tmp_path / f"images_{one}", 3, (6000 // one, 40 // one))
-    layout = posed_layout(tmp_path)
-    assert layout.words[-1] == str(factor)
+    assert posed_layout(tmp_path).words[-1] == str(factor)
     (tmp_path / "transforms.json").write_text("{}")
     assert is_posed(tmp_path)
     assert posed_layout(tmp_path) is None, "a transforms.json comes first"

@@ -98,8 +98,7 @@ def test_training_resumes_from_the_newest_complete_checkpoint(folder, capsys):
 def test_a_requested_step_is_not_replaced(folder, step):
     made = trainer()
     made.config.load_step = step
-    error = verdict(made._load_checkpoint, 10**6)
-    assert f"step-{step:09d}.ckpt" in str(error)
+    assert f"step-{step:09d}.ckpt" in str(verdict(made._load_checkpoint, 10**6))
 
 
 EXTRA, PARAMETERS = "pipeline/_model._extra_state", "pipeline/_model.gauss_params"

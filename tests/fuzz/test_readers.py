@@ -190,8 +190,7 @@ def test_bombs_are_refused_before_they_unpack(stated, words, good, tmp_path):
     stream = b"".join(deflate.compress(bytes(1 << 24)) for _ in range(20)) + deflate.flush()
     meta, body = header_and_body(good("a.sundae"))
     meta["sections"].append({"name": "a", "dtype": "|u1", "shape": [stated], "parts": [len(stream)]})
-    content = resealed(meta, body + stream)
-    (tmp_path / "a.sundae").write_bytes(content)
+    (tmp_path / "a.sundae").write_bytes(resealed(meta, body + stream))
     refused(read_scene, tmp_path / "a.sundae", words, PackError)
 
 
@@ -202,8 +201,7 @@ def test_a_few_constant_planes_cannot_fill_the_memory(tmp_path):
     meta, body = header_and_body(path.read_bytes())
     padding = meta["sections"].pop()
     assert padding["name"] == "padding"
-    content = resealed(meta, body[: len(body) - sum(padding["parts"])])
-    path.write_bytes(content)
+    path.write_bytes(resealed(meta, body[: len(body) - sum(padding["parts"])]))
     refused(read_scene, path, "would unpack to", PackError)
 
 

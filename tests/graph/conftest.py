@@ -34,8 +34,7 @@ def _piles(n):
 
 
 def _lattice(n):
-    side = int(np.ceil(n ** (1 / 3)))
-    cells = torch.cartesian_prod(*[torch.arange(side, dtype=torch.float64)] * 3)
+    cells = torch.cartesian_prod(*[torch.arange(int(np.ceil(n ** (1 / 3))), dtype=torch.float64)] * 3)
     return cells[torch.randperm(len(cells), generator=torch.Generator().manual_seed(2))[:n]]
 
 

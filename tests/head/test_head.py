@@ -143,8 +143,7 @@ def test_half_of_the_windows_are_mirrored_if_asked():
     for limit in (0, 900):
         plain = [training_crop(40, 30, limit, seed) for seed in range(400)]
         both = [training_crop(40, 30, limit, seed, mirror=True) for seed in range(400)]
-        mirrored = [crop for crop in both if crop is not None and crop.mirrored]
-        assert 160 < len(mirrored) < 240
+        assert 160 < len([crop for crop in both if crop is not None and crop.mirrored]) < 240
         for before, after in zip(plain, both, strict=True):
             whole = Crop(0, 0, 40, 30) if before is None else before
             assert (whole if after is None else after._replace(mirrored=False)) == whole

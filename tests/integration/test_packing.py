@@ -61,8 +61,7 @@ def test_the_table_counts_every_byte(tiny, tmp_path, capsys):
         r"\d+\.\d\d -> \d+\.\d\d dB, SSIM 0\.\d{4} -> 0\.\d{4}, before and after, on 3 of 3 test views\n", measured
     )
     rows = {words[0]: int(words[1].replace(",", "")) for words in map(str.split, table.strip().splitlines())}
-    size = file.stat().st_size
-    assert rows.pop("all") == size == sum(rows.values())
+    assert rows.pop("all") == file.stat().st_size == sum(rows.values())
     assert {"means", "quats", "scales", "features", "head", "cameras", "header"} <= set(rows)
 
 

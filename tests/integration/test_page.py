@@ -268,8 +268,7 @@ def test_a_hostile_file_ends_in_a_message(folder, tmp_path):
 
 @pytest.mark.parametrize("drawn", ["webgpu", "webgl"])
 def test_a_view_of_too_many_primitives_is_not_drawn(drawn, tmp_path):
-    packed = write_bomb(tmp_path / "a.sundae")
-    write_page(tmp_path / "a.html", ("a", *packed_file(packed)))
+    write_page(tmp_path / "a.html", ("a", *packed_file(write_bomb(tmp_path / "a.sundae"))))
     flags = browser.WEBGPU if drawn == "webgpu" else WEBGL
     with opened((tmp_path / "a.html").as_uri(), flags=flags, size=(640, 480)) as page:
         assert page.evaluate("sundae.drawn") == drawn

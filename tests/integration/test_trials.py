@@ -461,8 +461,7 @@ def test_a_paused_run_is_resumed_with_figures_and_trains_again_after_its_schedul
     stop, losses, put_scalar = STEPS - 25, [], writer.put_scalar
     whole = make(name="whole", steps_per_save=stop)
     whole.train()
-    longer = make(name="longer", load_dir=whole.checkpoint_dir, max_num_iterations=5)
-    assert len(trained(longer)[0]) == 5
+    assert len(trained(make(name="longer", load_dir=whole.checkpoint_dir, max_num_iterations=5))[0]) == 5
 
     def noted(name, scalar, step):
         losses.extend([float(scalar)] if name == "Train Loss" else [])

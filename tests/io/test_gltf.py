@@ -135,8 +135,7 @@ def test_places_of_unusual_scenes(tmp_path, kind):
 def added(document, binary, values, component, **accessor):
     """The buffer with values ``[N, C]``, of which the last accessor tells."""
     kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1]]
-    view = {"buffer": 0, "byteOffset": len(binary), "byteLength": values.nbytes}
-    document["bufferViews"].append(view)
+    document["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": values.nbytes})
     about = {"bufferView": len(document["bufferViews"]) - 1, "count": len(values), "componentType": component}
     document["accessors"].append({**about, "type": kind, **accessor})
     document["buffers"][0]["byteLength"] = len(binary) + values.nbytes

@@ -58,8 +58,7 @@ def draw(source, camera):
     params = source.primitives(camera, COLORS, features=True)
     shapes = params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid().squeeze(-1)
     colors = torch.cat([params["colors"], params["features"]], dim=1)
-    inputs = Inputs(*shapes, colors, camera, absgrad=True, render_depth=True)
-    shown = rasterize(inputs, backend=REFERENCE)
+    shown = rasterize(Inputs(*shapes, colors, camera, absgrad=True, render_depth=True), backend=REFERENCE)
     if shown.info["means2d"].requires_grad:
         shown.info["means2d"].retain_grad()
     return shown
@@ -110,8 +109,7 @@ def check_drawing(rank):
             counts += image.radii > 0
             radii = radii.maximum(image.radii.double() / max(cam.width, cam.height))
         for name, expected in (("grad2d", norms), ("count", counts), ("radii", radii)):
-            found = state.densification[name]
-            torch.testing.assert_close(found, expected[start:end], rtol=1e-6, atol=1e-8)
+            torch.testing.assert_close(state.densification[name], expected[start:end], rtol=1e-6, atol=1e-8)
 
 
 class Halving(Callback):
@@ -178,8 +176,7 @@ def check_gathering(rank):
 
 def check_an_empty_shard(rank):
     """Fewer Gaussians than ranks: a rank without any renders those of the other, and takes a step."""
-    alone = GaussianSource(gaussians_of(gaussians()))
-    seen = int(draw(alone, camera(0)).radii.argmax())
+    seen = int(draw(GaussianSource(gaussians_of(gaussians())), camera(0)).radii.argmax())
     state = state_of(gaussians_of(gaussians(), seen, seen + 1))
     _, model = shared(rank, state)
     assert model.source.sizes == [0, 1]

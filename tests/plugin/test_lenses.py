@@ -186,8 +186,7 @@ def test_four_radial_coefficients(capture, load, edit, distortion):
     # The photo fills the image, up to a step of 3%.
     assert across.min() > -0.01
     assert across.max() < width - 0.99
-    least = min(across.min(), down.min(), width - 1 - across.max(), height - 1 - down.max())
-    assert least < 2
+    assert min(across.min(), down.min(), width - 1 - across.max(), height - 1 - down.max()) < 2
 
 
 def test_an_angle_of_view_gives_the_focal_length(capture, load, edit):

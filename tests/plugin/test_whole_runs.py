@@ -114,8 +114,7 @@ def check_training(rank, folder):
     assert (group["lr"], tuple(group["betas"])) == (0.05, (0.9, 0.999))
     for scheduler in trainer.optimizers.schedulers.values():
         assert scheduler.last_epoch == STEPS
-    decays = trainer.optimizers.schedulers["means"].state_dict()["lr_lambdas"]
-    assert decays[0]["pruned_at"] == PRUNE_AT
+    assert trainer.optimizers.schedulers["means"].state_dict()["lr_lambdas"][0]["pruned_at"] == PRUNE_AT
 
 
 def check_frozen(rank, folder):
@@ -125,8 +124,7 @@ def check_frozen(rank, folder):
 def check_few(rank, folder):
     """A field of one Gaussian trains, is saved and resumed, with nothing on one rank."""
     config = frozen(folder, "few")
-    model = config.pipeline.model
-    model.pruning.keep_ratio = 1e-6
+    config.pipeline.model.pruning.keep_ratio = 1e-6
     train(config, rank, RANKS)
     config = frozen(folder, "few again")
     config.load_checkpoint = saved(folder, "few", RANKS - 1)

@@ -120,8 +120,7 @@ def test_decisions_of_a_known_field_stay_as_they_are(name):
         params[key] = 2 * torch.rand(300, width, generator=torch.Generator().manual_seed(seed)) - 3 * (key == "scales")
         params[key][200:240] = params[key][200]
     params |= {"quats": torch.eye(4)[[0] * 300], "features_rest": torch.zeros(300, 0, 3)}
-    weights = torch.linspace(0, 3, 300).square()
-    found = prune_gaussians(params, RULES[name], 45, weights)
+    found = prune_gaussians(params, RULES[name], 45, torch.linspace(0, 3, 300).square())
     sums = [float(found.gaussians[key].double().sum()) for key in ("means", "features_dc")]
     digest = hashlib.sha256(found.decision.mask.numpy().tobytes()).hexdigest()[:8]
     assert (digest, sums) == (GOLDEN[name][0], pytest.approx(GOLDEN[name][1], rel=1e-5))

@@ -113,8 +113,7 @@ def test_logits_are_pruned_as_their_colours(rule):
     found, expected = (decide_share(each, draws(**rule), 0.3, WEIGHTS) for each in fields)
     assert torch.equal(found.mask, expected.mask)
     colors = sh_to_rgb(expected.values["features_dc"]).clamp(1e-3, 1 - 1e-3)
-    own = logits["features_dc"][found.mask]
-    same = found.values["features_dc"] == own
+    same = found.values["features_dc"] == logits["features_dc"][found.mask]
     assert 0 < int(same.all(dim=1).sum()) < found.kept
     torch.testing.assert_close(found.values["features_dc"].sigmoid()[~same], colors[~same], rtol=0, atol=1e-6)
     for name in found.values.keys() - {"features_dc"}:
@@ -161,8 +160,7 @@ def test_labels_name_a_member_and_the_unseen_are_dropped_in_few_rounds(monkeypat
 def test_the_most_alike_pair_merges_first():
     near = row(0.0, 1.0, 1.1, 2.1)
     assert pair_labels(near, graph_of(near), torch.ones(4), 3).tolist() in ([0, 1, 1, 3], [0, 2, 2, 3])
-    colors = torch.tensor([[0.9] * 3, [0.1] * 3, [0.1] * 3, [0.9] * 3])
-    even = row(0.0, 1.0, 2.0, 3.0, colors=colors)
+    even = row(0.0, 1.0, 2.0, 3.0, colors=torch.tensor([[0.9] * 3, [0.1] * 3, [0.1] * 3, [0.9] * 3]))
     assert pair_labels(even, graph_of(even), torch.ones(4), 3).tolist() in ([0, 1, 1, 3], [0, 2, 2, 3])
     # Equal steps: the pair of least weight changes an image least.
     labels = pair_labels(even := row(0.0, 1.0, 2.0, 3.0), graph_of(even), torch.tensor([1.0, 2.0, 3.0, 4.0]), 3)

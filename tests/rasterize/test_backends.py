@@ -297,8 +297,7 @@ def harmonics(degree, directions, coeffs, backend):
     weights = torch.randn(value.shape, generator=torch.Generator().manual_seed(7), dtype=F64)
     weights[::5] = 0  # Gaussians that no pixel sees
     loss = (value * weights.to(value.device)).sum()
-    grads = torch.autograd.grad(loss, leaves, materialize_grads=True, allow_unused=True)
-    return [value.detach(), *grads]
+    return [value.detach(), *torch.autograd.grad(loss, leaves, materialize_grads=True, allow_unused=True)]
 
 
 @pytest.mark.parametrize("dtype", [F64, F32])

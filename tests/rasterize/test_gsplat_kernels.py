@@ -171,8 +171,7 @@ def test_capacity_keeps_the_lists_and_reports_the_number_of_pairs():
     (needed,) = capacity.needed
     assert int(needed) == sum(map(len, exact))
     for spare in (0, 1000):
-        spacious = Capacity(int(needed) + spare)
-        *found, below = by_tile(primitives, 150, 100, spacious)[: len(exact) + 1]
+        *found, below = by_tile(primitives, 150, 100, Capacity(int(needed) + spare))[: len(exact) + 1]
         assert all(torch.equal(a, b) for a, b in zip(found, exact, strict=True))
         assert len(below) == spare  # a tile below the image takes the unused pairs
     short = Capacity(int(needed) - 5)

@@ -114,8 +114,7 @@ def test_the_worst_and_the_best_view_are_among_those_that_are_shown():
             assert chosen == sorted(set(chosen))
             assert {int(np.argmin(qualities)), int(np.argmax(qualities))} <= set(chosen)
     qualities = [float(7 * i % 300) for i in range(300)]  # others are evenly spaced between them
-    ranks = sorted(qualities[i] for i in choose_cameras(qualities, 24))
-    assert set(np.diff(ranks)) == {13.0}
+    assert set(np.diff(sorted(qualities[i] for i in choose_cameras(qualities, 24)))) == {13.0}
     qualities[31] = math.nan  # counts as worst
     assert choose_cameras(qualities, 2) == [31, qualities.index(299.0)]
 
@@ -225,8 +224,7 @@ def test_its_figures_are_those_of_the_report(measured):
 
 def test_hostile_names_stay_text(measured):
     run = replace(measured(HOSTILE, scene=HOSTILE), source=HOSTILE, method=HOSTILE, variant=HOSTILE)
-    text = page_of(shown(run, name=HOSTILE, curve=CURVE), notes=(HOSTILE,))
-    hostile = Page(text)
+    hostile = Page(page_of(shown(run, name=HOSTILE, curve=CURVE), notes=(HOSTILE,)))
     plain = Page(page_of(shown(measured(), name="b", curve=CURVE), notes=("a note",)))
     assert [name for name, _ in hostile.elements] == [name for name, _ in plain.elements]
     assert [list(found) for _, found in hostile.elements] == [list(found) for _, found in plain.elements]

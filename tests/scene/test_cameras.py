@@ -134,8 +134,7 @@ def test_virtual_views_are_the_same_for_a_seed_and_see_the_scene():
     one, same, other = (sn.virtual_cameras(scene(), 16, seed=seed) for seed in (0, 0, 1))
     assert all(torch.equal(a.viewmat, b.viewmat) for a, b in zip(one, same, strict=True))
     assert not torch.equal(one[0].viewmat, other[0].viewmat)
-    seen = [float(sn.render(scene(), camera).accumulation.max()) for camera in one]
-    assert min(seen) > 0
+    assert min([float(sn.render(scene(), camera).accumulation.max()) for camera in one]) > 0
 
 
 @pytest.mark.usefixtures("short_prunes")
@@ -151,8 +150,7 @@ def test_a_scene_of_any_size_is_pruned_alike(factor):
 @pytest.mark.parametrize("count", [5, 999])
 def test_the_factor_of_a_limited_sum(count):
     values = torch.rand(1000, generator=torch.Generator().manual_seed(0), dtype=torch.float64).pow(9)
-    factor = virtual._factor(values, count)
-    assert float((factor * values).clamp(max=1).sum()) == pytest.approx(count)
+    assert float((virtual._factor(values, count) * values).clamp(max=1).sum()) == pytest.approx(count)
     assert virtual._factor(torch.zeros(1000).double(), count).isfinite()
 
 
@@ -162,8 +160,7 @@ def test_a_gpu_judges_cameras_like_a_cpu(evenness):
     made = scene()
     sizes, eyes = made.gaussians["scales"].mean(dim=1), ball(150).double()
     targets = made.gaussians["means"][:1].double().expand(150, 3)
-    on_gpu = made.to("cuda")
-    found = virtual._coarseness(on_gpu, sizes.cuda(), eyes, targets, evenness)
+    found = virtual._coarseness(made.to("cuda"), sizes.cuda(), eyes, targets, evenness)
     torch.testing.assert_close(found, virtual._coarseness(made, sizes, eyes, targets, evenness), rtol=1e-2, atol=1e-2)
 
 
@@ -266,8 +263,7 @@ def test_a_primitive_lands_where_the_pinhole_says(build, camera):
     xyz = torch.tensor([[0.55, 0.35, 0.0]])
     model = build(seed_points=(xyz, torch.zeros(1, 3, dtype=torch.uint8))).eval()
     model.gauss_params["scales"].data.fill_(-5)
-    alpha = model.get_outputs_for_camera(camera())["accumulation"][..., 0]
-    row, column = divmod(int(alpha.argmax()), 40)
+    row, column = divmod(int(model.get_outputs_for_camera(camera())["accumulation"][..., 0].argmax()), 40)
     # In front of the camera by 3; x to the right, y up, pixel centres at one half.
     assert (column, row) == (int(20 + 30 * 0.55 / 3), int(16 - 30 * 0.25 / 3))
 

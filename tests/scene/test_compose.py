@@ -129,8 +129,7 @@ def test_a_merge_is_both_scenes():
 def test_a_head_goes_with_its_features(tmp_path):
     whole = headed(tmp_path)
     parts = sn.merge([whole[::2], whole[1::2].to("cpu")])
-    camera = whole.cameras[0]
-    assert sn.measure(parts, whole, camera).psnr > 60
+    assert sn.measure(parts, whole, whole.cameras[0]).psnr > 60
     assert parts.head is whole.head is not None
     other = dataclasses.replace(whole, head=type(whole.head)(whole.head.config))
     for odd in (other, dataclasses.replace(whole, head=None)):

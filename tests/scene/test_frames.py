@@ -291,8 +291,7 @@ def test_colours_are_in_range_grey_at_the_mean_and_black_in_empty_pixels():
     def colors(shown, of, alpha=1.0):
         return frames.feature_colors(shown, *frames.principal_components(of), torch.full((*shown.shape[:2], 1), alpha))
 
-    values = features().reshape(40, 50, 5)
-    shown = colors(values, features())
+    shown = colors(features().reshape(40, 50, 5), features())
     assert ((shown >= 0) & (shown <= 1)).all()
     # Three deviations fill the range: almost nothing is clipped, and all channels vary equally.
     assert ((shown > 0) & (shown < 1)).float().mean() > 0.99

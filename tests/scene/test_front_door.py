@@ -76,8 +76,7 @@ def test_the_lines_of_the_pages_run_without_nerfstudio(garden):
 
 def test_every_public_name_is_there_and_documented():
     for name in sn.__all__:
-        value = getattr(sn, name)
-        assert inspect.getdoc(value), name
+        assert inspect.getdoc(getattr(sn, name)), name
         assert name in dir(sn)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         sn.nothing  # noqa: B018

@@ -81,8 +81,7 @@ def assert_moved(
     for field, seen in ((found, directions @ turn.T.double()), (truth, directions)):
         shapes.append(covariances(field["scales"].double().exp(), field["quats"].double()))
         rest = field["features_rest"].double()
-        basis = harmonic_basis(sh_degree(rest), seen)[:, 1:]
-        colors.append(torch.einsum("dk,nkc->ndc", basis, rest))
+        colors.append(torch.einsum("dk,nkc->ndc", harmonic_basis(sh_degree(rest), seen)[:, 1:], rest))
     turn = turn.double()
     means = scale * (truth["means"].double() @ turn.T + shift)
     torch.testing.assert_close(found["means"].double(), means, rtol=0, atol=atol)

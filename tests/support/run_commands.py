@@ -63,8 +63,7 @@ class Commands:
 
     def run_folder(self, place: int = -1) -> Path:
         """Of a training."""
-        words = " ".join(self.ran[place])
-        name = "--experiment-name" if "--experiment-name" in words else "--data"
+        name = "--experiment-name" if "--experiment-name" in " ".join(self.ran[place]) else "--data"
         root, experiment, stamp = (self.option(each, place) for each in ("--output-dir", name, "--timestamp"))
         return Path(root, experiment, self.ran[place][1], stamp)
 

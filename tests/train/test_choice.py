@@ -134,8 +134,7 @@ def test_a_candidate_must_gain_over_the_cheaper_ones_and_must_lose_neither_psnr_
 
 @pytest.mark.parametrize(("gain", "size", "best"), [(0.41, 200, "head"), (0.39, 200, "plain"), (0.39, 190, "head")])
 def test_a_candidate_that_takes_more_bytes_must_gain_more(gain, size, best):
-    measured = [[[10.0, 20.0, 0.5]], [[10.0, 20.0 + gain, 0.5]]]
-    assert best_of(measured, sizes=(100, size, 400)) == best
+    assert best_of([[[10.0, 20.0, 0.5]], [[10.0, 20.0 + gain, 0.5]]], sizes=(100, size, 400)) == best
 
 
 @pytest.fixture

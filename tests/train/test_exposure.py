@@ -146,8 +146,7 @@ def test_cameras_at_one_place_are_apart_by_what_they_see():
     eye = torch.zeros(3)
     cameras = [Camera.look_at(eye, (math.cos(a), math.sin(a), 0.0)) for a in ANGLES]
     cameras += [Camera.look_at((4.0, 0.0, 0.0), (9.0, 0.0, 0.0))]
-    points = view_points(cameras)[:-1]
-    apart = np.linalg.norm(points.diff(dim=0).numpy(), axis=1)
+    apart = np.linalg.norm(view_points(cameras)[:-1].diff(dim=0).numpy(), axis=1)
     assert apart == pytest.approx(apart[0], rel=1e-3)
     assert apart[0] > 0.01
 

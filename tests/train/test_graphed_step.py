@@ -229,8 +229,7 @@ def test_buffers_are_new_only_when_the_field_does_not_fit(build, training_of, mo
         parameter = state.gaussians[name]
         parameter.data = torch.cat([parameter.data, parameter.data[:5]])
         for moment in ("exp_avg", "exp_avg_sq"):
-            held = state.optimizers[name].state[parameter]
-            held[moment] = torch.ones_like(parameter)
+            state.optimizers[name].state[parameter][moment] = torch.ones_like(parameter)
     assert not buffers.hold(state, trained, growing=True)
     assert places == {name: value.data_ptr() for name, value in buffers.tensors.items()}
     assert all(torch.equal(state.gaussians[name], torch.cat([values[name], values[name][:5]])) for name in trained)

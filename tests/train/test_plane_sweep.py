@@ -86,8 +86,7 @@ def test_masked_pixels_give_no_points(capture):
     photos, sparse = capture
     left = torch.zeros(SIDE, SIDE, dtype=torch.bool)
     left[:, : SIDE // 2] = True
-    sweep = Sweep([photos[0]._replace(mask=left), *photos[1:]], sparse, SIDE)
-    depth = sweep.add(0)
+    depth = Sweep([photos[0]._replace(mask=left), *photos[1:]], sparse, SIDE).add(0)
     assert (depth[:, : SIDE // 2] > 0).any()
     assert not (depth[:, SIDE // 2 :] > 0).any()
 

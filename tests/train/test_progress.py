@@ -52,8 +52,7 @@ def test_the_time_left_does_not_jump():
     watch, total, done, now = TimeLeft(), 30000, 0, 0.0
     found = []
     while done < total:
-        steps = round(10 / (0.016 if len(found) % 2 else 0.124))
-        done, now = min(done + steps, total), now + 10
+        done, now = min(done + round(10 / (0.016 if len(found) % 2 else 0.124)), total), now + 10
         found.append((watch.update(done, total, now) or math.nan, now))
     later = [left for left, _ in found[10:-6]]
     assert all(1 / 1.5 < after / before < 1.5 for before, after in zip(later, later[1:]))

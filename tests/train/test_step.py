@@ -90,8 +90,7 @@ def test_the_view_of_a_training_camera_is_made_once(build, camera, batch, monkey
 @pytest.mark.parametrize("mode", ["residual", "features"])
 def test_head_and_field_learn_together(build, perturb, camera, batch, mode):
     model = perturb(build(head={"mode": mode})).train()
-    outputs = model.get_outputs(camera())
-    losses = model.get_loss_dict(outputs, batch())
+    losses = model.get_loss_dict(model.get_outputs(camera()), batch())
     assert set(losses) == {"main_loss", "base_loss"}
     assert all(isinstance(value, Tensor) for value in losses.values())
     torch.stack(list(losses.values())).sum().backward()

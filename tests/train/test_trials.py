@@ -47,8 +47,7 @@ class FakeRun:
 
 def trials_for(state, begins_at=-math.inf):
     head, pruning = SimpleNamespace(mode="auto"), PruningConfig(keep_ratio=None)
-    options = SimpleNamespace(pruning=pruning, head=head, ssim_lambda=0.2)
-    return Trials(options, state, None, begins_at)
+    return Trials(SimpleNamespace(pruning=pruning, head=head, ssim_lambda=0.2), state, None, begins_at)
 
 
 @pytest.fixture
