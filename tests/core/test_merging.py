@@ -65,8 +65,7 @@ def test_a_wall_of_small_primitives_absorbs_as_much_light_after_merging():
 
 def test_merging_commutes_with_rotation_scale_and_shift():
     params, label, w = gaussians(), torch.tensor([0, 0, 0, 3, 3, 3, 6, 6, 6, 9, 9, -1]), torch.rand(12)
-    turn = torch.randn(1, 4, dtype=torch.float64)
-    R = rotation_matrices(turn)[0]
+    R = rotation_matrices(torch.randn(1, 4, dtype=torch.float64))[0]
     moved = {**params, "means": 8 * params["means"] @ R.T + 100, "scales": params["scales"] + math.log(8)}
     moved["quats"] = quaternions(R @ rotation_matrices(params["quats"]))
     before, after = merge(params, label, w), merge(moved, label, w)
@@ -143,8 +142,7 @@ def test_overlap_is_that_of_the_formula_and_1_with_itself():
 
 
 def test_overlap_of_flat_ones_and_of_needles():
-    flat = of_widths([[0, 0, 0]] * 2, [[1, 1, 0]] * 2, [1, 0, 0, 0])
-    assert neighbours(flat, [[1], [0]]).isfinite().all()
+    assert neighbours(of_widths([[0, 0, 0]] * 2, [[1, 1, 0]] * 2, [1, 0, 0, 0]), [[1], [0]]).isfinite().all()
     # Pivots of crossed needles, turned away from the axes, are lost to rounding.
     needles = of_widths([[0, 0, 0]] * 2, [[1e6, 1e-6, 1e-6], [1e-6, 1e6, 1e-6]], [0.3, -0.5, 0.7, 0.2])
     found = neighbours(needles, [[0, 1], [1, 0]], 1e-12)

@@ -78,8 +78,7 @@ def images(height, width, seed=0):
     generator = torch.Generator().manual_seed(seed)
     target = torch.rand(height, width, 3, generator=generator).mul(3).round() / 3
     target[: height // 3] = 0.25
-    noise = torch.randn(height, width, 3, generator=generator)
-    return (target + 0.1 * noise).clamp(0, 1), target
+    return (target + 0.1 * torch.randn(height, width, 3, generator=generator)).clamp(0, 1), target
 
 
 def exact_loss(image, target, weight):

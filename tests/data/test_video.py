@@ -217,17 +217,15 @@ def playlist(text):
 def panorama(path):
     """An .mp4 whose track states a sphere, as cameras of 360 degrees write it (Google's Spherical Video V1)."""
     write_colours(path, 5 * [patches()], 1)
-    content, tag = bytearray(path.read_bytes()), "<GSpherical:{0}>{1}</GSpherical:{0}>"
-    words = {"Spherical": "true", "Stitched": "true", "StitchingSoftware": "x", "ProjectionType": "equirectangular"}
-    text = bytes.fromhex("ffcc8263f8554a938814587a02521fdd")
-    text += "".join(tag.format(*item) for item in {"SphericalVideo": "", **words}.items()).encode()
-    ends = []
+    content, stated = bytearray(path.read_bytes()), {"SphericalVideo": "", "Spherical": "true", "Stitched": "true"}
+    stated |= {"StitchingSoftware": "x", "ProjectionType": "equirectangular"}
+    text = "".join(f"<GSpherical:{name}>{word}</GSpherical:{name}>" for name, word in stated.items()).encode()
+    box = struct.pack(">I4s", 24 + len(text), b"uuid") + bytes.fromhex("ffcc8263f8554a938814587a02521fdd") + text
     for name in (b"moov", b"trak"):
         start = content.index(name) - 4
-        (size,) = struct.unpack_from(">I", content, start)
-        struct.pack_into(">I", content, start, size + 8 + len(text))
-        ends.append(start + size)
-    path.write_bytes(content[: ends[1]] + struct.pack(">I", 8 + len(text)) + b"uuid" + text + content[ends[1] :])
+        end = start + struct.unpack_from(">I", content, start)[0]
+        struct.pack_into(">I", content, start, end - start + len(box))
+    path.write_bytes(content[:end] + box + content[end:])
 
 
 UNREADABLE = "is not a video that FFmpeg decodes .*; convert it to .mp4"

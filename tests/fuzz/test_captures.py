@@ -62,8 +62,7 @@ def test_damaged_files(warm, capture, file, change):
         old = meta_of(capture)["frames"][0]["file_path"]
         with Image.open(capture / old) as image:
             image.convert("RGB").save(path)
-        text = (capture / "transforms.json").read_text().replace(old, file)
-        (capture / "transforms.json").write_text(text)
+        (capture / "transforms.json").write_text((capture / "transforms.json").read_text().replace(old, file))
     content = path.read_bytes()
     path.write_bytes(change(content))
     try:
@@ -187,8 +186,7 @@ def _patch(file, at, layout, *values):
 
 
 def _twice(model):
-    camera = (model / "cameras.bin").read_bytes()[8:]
-    (model / "cameras.bin").write_bytes(struct.pack("<Q", 2) + camera * 2)
+    (model / "cameras.bin").write_bytes(struct.pack("<Q", 2) + (model / "cameras.bin").read_bytes()[8:] * 2)
 
 
 def _folder(file):

@@ -40,8 +40,7 @@ def splatted(height, width, num_features, *, seed=0):
     generator = torch.Generator().manual_seed(seed)
     everything = torch.rand(height, width, 4 + num_features, generator=generator)
     alpha = torch.rand(height, width, 1, generator=generator)
-    base = torch.rand(height, width, 3, generator=generator)
-    return base, everything[..., :-1], alpha
+    return torch.rand(height, width, 3, generator=generator), everything[..., :-1], alpha
 
 
 @torch.no_grad()

@@ -203,8 +203,7 @@ def test_any_size(unshuffle, height, width):
     out = UNet(5, 3, 4, pixel_unshuffle=unshuffle)(image)
     assert out.shape == (1, 3, height, width)
     assert out.isfinite().all()
-    zero = UNet(5, 3, 4, pixel_unshuffle=unshuffle, zero_init=True)
-    assert torch.equal(zero(image), torch.zeros_like(out))
+    assert torch.equal(UNet(5, 3, 4, pixel_unshuffle=unshuffle, zero_init=True)(image), torch.zeros_like(out))
 
 
 def test_padding_affects_the_edge_only():

@@ -197,8 +197,7 @@ def test_positions_of_a_spz_get_as_many_bits_as_fit(tmp_path, farthest, bits):
     gaussians = small_field(50)
     gaussians["means"] *= farthest / gaussians["means"].abs().max() or 1e-9
     write_for_viewers(tmp_path / "a.spz", gaussians)
-    raw = gzip.decompress((tmp_path / "a.spz").read_bytes())
-    assert len(raw) == 16 + 50 * (9 + 1 + 3 + 3 + 4 + 9)
+    assert len(gzip.decompress((tmp_path / "a.spz").read_bytes())) == 16 + 50 * (9 + 1 + 3 + 3 + 4 + 9)
     means = read_gaussian_file(tmp_path / "a.spz")[0].gaussians["means"]
     assert (means - gaussians["means"]).abs().max() <= 2.0 ** -(bits + 1) + 1e-7
 

@@ -102,8 +102,7 @@ def test_nerfstudio_finds_its_newest_beside_a_killed_save(tmp_path):
     saved(tmp_path, 10, 20)
     killed = tmp_path / checkpoint._PARTIAL.format(os.getpid())
     killed.write_bytes(b"half")
-    steps = sorted(int(x[x.find("-") + 1 : x.find(".")]) for x in os.listdir(tmp_path))
-    assert steps[-1] == 20
+    assert sorted(int(x[x.find("-") + 1 : x.find(".")]) for x in os.listdir(tmp_path))[-1] == 20
     saved(tmp_path, 30)
     assert sorted(os.listdir(tmp_path)) == [name(10), name(20), name(30)]
 

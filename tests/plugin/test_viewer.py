@@ -86,8 +86,7 @@ def test_the_slider_tells_what_fewer_primitives_lose():
         controls.keep_ratio.value = share
         controls._show_expected(controls.keep_ratio)
         assert controls.expected.value == text
-    half = expected_change(points, N // 3, round(N / math.sqrt(3)))
-    assert half == pytest.approx((0.3, 0.0075), abs=0.01)
+    assert expected_change(points, N // 3, round(N / math.sqrt(3))) == pytest.approx((0.3, 0.0075), abs=0.01)
     assert model.count_curve() == []
 
 

@@ -143,8 +143,7 @@ def row(*places, colors=None):
     """Gaussians of width 0.5 along the x axis, grey unless colours are given."""
     means = torch.tensor([[place, 0.0, 0.0] for place in places])
     colors = torch.full_like(means, 0.5) if colors is None else colors
-    params = from_points(means, colors, sh_degree=0)
-    return Gaussians({**params, "scales": torch.full_like(means, 0.5).log()})
+    return Gaussians({**from_points(means, colors, sh_degree=0), "scales": torch.full_like(means, 0.5).log()})
 
 
 def test_labels_name_a_member_and_the_unseen_are_dropped_in_few_rounds(monkeypatch):

@@ -172,8 +172,7 @@ def test_gradcheck(backend, n, size, antialiased, fast):
 def test_absgrad_is_the_sum_of_absolute_pixel_gradients(backend):
     values, camera = scene(9), make_view(10, 7)
     ours = splat(leaves_of(values, F64), camera, backend, absgrad=True)
-    target = torch.rand(7, 10, 3, dtype=F64)
-    losses = (ours.colors - target).square().sum(dim=-1) + ours.alpha[..., 0]
+    losses = (ours.colors - torch.rand(7, 10, 3, dtype=F64)).square().sum(dim=-1) + ours.alpha[..., 0]
     expected, signed = torch.zeros(2, 1, 9, 2, dtype=F64)
     for loss in losses.flatten():
         (gradient,) = torch.autograd.grad(loss, ours.info["means2d"], retain_graph=True)

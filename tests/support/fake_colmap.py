@@ -135,8 +135,7 @@ class FakeColmap:
         images = {number: image(number, name) for number, name in enumerate(names)}
 
         def write(to: Path) -> None:
-            posed = [one.name for one in images.values() if one.has_pose]
-            (to / "images.json").write_text(json.dumps(posed))
+            (to / "images.json").write_text(json.dumps([one.name for one in images.values() if one.has_pose]))
 
         lens = SimpleNamespace(width=16, height=12, params=np.array([15.0, 15, 8, 6, 0, 0, 0, 0]))
         point = SimpleNamespace(xyz=np.array([1.0, 2, 3]), color=np.array([10, 20, 30]))

@@ -150,8 +150,7 @@ def test_all_pixels_count_or_those_under_the_mask(pair):
     assert bare[:3] == (24 * 32, pytest.approx(float(psnr(*pair))), pytest.approx(float(ssim(*pair))))
     mask = torch.zeros(24, 32, dtype=torch.bool)
     mask[:, :16] = True
-    spoilt = torch.where(mask[..., None], image, torch.full_like(image, math.nan))
-    found = view_quality(spoilt, target, mask)
+    found = view_quality(torch.where(mask[..., None], image, torch.full_like(image, math.nan)), target, mask)
     error = (image - target)[:, :16].square().mean()
     assert found.pixels == 24 * 16
     assert found.psnr == pytest.approx(float(-10 * torch.log10(error)), abs=1e-4)
