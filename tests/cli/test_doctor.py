@@ -124,7 +124,8 @@ def test_nvcc_is_searched_like_torch_and_gsplat_do(no_compiler, monkeypatch):
     monkeypatch.setenv("CUDA_HOME", str(home))
     compiler(no_compiler, "release 12.0")
     assert f"not found in {home / 'bin'}" in check("nvcc")[1]
-    assert check("nvcc")[1].startswith(f"{compiler(home / 'bin', 'release 13.0')} 13.0")
+    nvcc = compiler(home / "bin", "release 13.0")
+    assert check("nvcc")[1].startswith(f"{nvcc} 13.0")
     (no_compiler / "nvcc").unlink()
     assert check("nvcc")[1].startswith("not found in PATH")
     compiler(no_compiler, "release 12.0")
