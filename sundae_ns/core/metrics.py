@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import torch
 from pytorch_msssim import ssim as windowed_ssim
@@ -18,6 +18,7 @@ from sundae_ns.core.errors import DataError, one_line
 
 SSIM_WINDOW = 11  # side of SSIM's Gaussian window, pixels (Wang et al. 2004)
 MOST_PSNR = 100.0  # highest PSNR that a decision or a fit of colours gives, dB; 8-bit images carry no more
+AnyCamera = TypeVar("AnyCamera")
 Net = Literal["alex", "vgg", "squeeze"]
 logger = logging.getLogger(__name__)
 
@@ -129,7 +130,7 @@ class Quality:
 
 
 @torch.no_grad()
-def evaluate(render: Callable[[Any], Tensor], cameras: Iterable[Any], targets: Iterable[Tensor]) -> Quality:
+def evaluate(render: Callable[[AnyCamera], Tensor], cameras: Iterable[AnyCamera], targets: Iterable[Tensor]) -> Quality:
     """Compare the images ``[H, W, 3]`` that ``render`` gives for cameras, at least one, with true ones in [0, 1]."""
     pairs = ((render(camera), target) for camera, target in zip(cameras, targets, strict=True))
     values = [[float(metric(image, target.to(image))) for metric in (psnr, ssim)] for image, target in pairs]

@@ -94,8 +94,7 @@ def test_a_longer_training_goes_on_from_the_last_weights(state):
 
 def test_a_first_part_ends_with_the_mean_of_its_last_steps(state):
     """As far as it reaches into the share: what is packed from there on begins at the mean."""
-    mean = Averaging(0.09, settled_at=0)
-    assert_mean(state, train(state, mean, range(96), last=95), 2)
+    assert_mean(state, train(state, mean := Averaging(0.09, settled_at=0), range(96), last=95), 2)
     assert mean.state_dict()["replaced"]
 
 
