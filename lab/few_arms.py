@@ -13,20 +13,18 @@ from few_job import few_job  # its import finds the harness
 from harness.job import _measured, configure
 from sundae_ns.report.measure import Subject
 
-if until := os.environ.get("DROP_UNTIL"):  # leaves out Gaussians only until this step
-    from dataclasses import replace
+if more := int(os.environ.get("TWICE", 0)):  # views that were held out come so many times more, once they are back
+    from sundae_ns.plugin.datamanager import SundaeDatamanager
 
-    from sundae_ns.plugin.model import SundaeModel
-    from sundae_ns.train import graphed_step
+    hold_back = SundaeDatamanager.hold_back
 
-    settings_of, kind_of = SundaeModel.render_settings, graphed_step._kind
+    def hold_back_then_repeat(self, indices):
+        before = getattr(self, "holdout_indices", [])
+        hold_back(self, indices)
+        self.repeated = [*getattr(self, "repeated", []), *(more * [i for i in before if i not in self.holdout_indices])]
+        self._served += [i for i in self.repeated if i not in self.holdout_indices]
 
-    def settings_until(self, *, training):
-        settings = settings_of(self, training=training)
-        return settings if self.state.step < int(until) else replace(settings, drop_rate=0.0)
-
-    SundaeModel.render_settings = settings_until
-    graphed_step._kind = lambda state, inputs, settings: (kind_of(state, inputs, settings), settings.drop_rate)
+    SundaeDatamanager.hold_back = hold_back_then_repeat
 
 capture, out, name, method, steps, *words = sys.argv[1:]
 job = few_job(capture, f"{Path(capture).name}-{name}", name, method, int(steps), words)
