@@ -84,9 +84,8 @@ def write_text(path: Path, text: str) -> None:
 
 def write_image(path: Path, image: Image.Image) -> None:
     """Write an image as :func:`write_bytes` does, in the format of its suffix."""
-    kind = path.suffix.lower()[1:]
     with replacing(path) as partial:
-        image.save(partial, format={"jpg": "jpeg"}.get(kind, kind))
+        image.save(partial, format={"jpg": "jpeg"}.get(kind := path.suffix.lower()[1:], kind))
 
 
 def put_aside(path: Path) -> None:

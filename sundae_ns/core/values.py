@@ -18,14 +18,15 @@ _WHITE = {"uint8": 255.0, "uint16": 65535.0}  # of stored images, by their type
 
 
 def numbers(values: Any, name: str, *shapes: tuple[int, ...]) -> Tensor:
-    """Finite numbers of one of the shapes, float64 on the CPU; ``ConfigError`` for anything else."""
+    """Finite numbers of one of the shapes, float64 on the CPU; ``ConfigError`` for others, and for a lost gradient."""
+    given = values.detach() if isinstance(values, Tensor) and not torch.is_grad_enabled() else values
     try:
-        array = np.asarray(values.detach().cpu().double() if isinstance(values, Tensor) else values)
-    except (TypeError, ValueError, OverflowError, NotImplementedError):  # the last for tensors without values
+        array = np.asarray(given.cpu().double() if isinstance(given, Tensor) else given)
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last for tensors on meta, and with a gradient
         array = np.empty(0)
     if array.shape not in shapes or array.dtype.kind not in "iuf" or not (np.abs(array) < 3e38).all():  # of float32
         wanted = " or ".join(" x ".join(map(str, shape)) or "1" for shape in shapes)
-        raise ConfigError(f"{name} is not made of {wanted} finite numbers; give a list, an array or a tensor of these")
+        raise ConfigError(f"{name} is not made of {wanted} finite numbers; give a list, array or detached tensor")
     return torch.from_numpy(array.astype(np.float64))
 
 

@@ -311,8 +311,7 @@ def test_windows_wait_for_the_head_and_for_densification(build, perturb, camera)
     early = perturb(build(head={"max_train_pixels": 600, "start_at": 0}, pruning=densifying))
     assert early.state.head_enabled
     assert early.resolution(0) == StepResolution(0, 1, 0)  # densification takes its statistics from whole pictures
-    paper = perturb(build(head={"mode": "features"}))
-    assert not paper.resolution(0).mirror
+    assert not perturb(build(head={"mode": "features"})).resolution(0).mirror
 
 
 def made(seed):

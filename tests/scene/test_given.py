@@ -126,6 +126,8 @@ REFUSED = {
     "up": (lambda: dataclasses.replace(SCENE, up=(0, 0, 0)), "no direction"),
     "device": (lambda: SCENE.to("gpu"), "the device gpu is not available"),
     "eye": (lambda: look_at((1, 2, 3), (1, 2, 3)), "one point"),
+    "eye on meta": (lambda: look_at(torch.zeros(3, device="meta"), (0, 0, 0)), "eye is not made of 3 finite numbers"),
+    "lost gradient": (lambda: look_at(torch.ones(3, requires_grad=True), (0, 0, 0)), "or detached tensor"),
     "zero": (lambda: look_at((1, 2, 3), (0, 0, 0), (0, 0, 0)), "no direction"),
     "far": (lambda: look_at((0, 0, 1e300), (0, 0, 0)), "eye is not made of 3 finite numbers"),
     "size 0": (lambda: look_at((0, 0, 1), (0, 0, 0), width=0), "width is 0"),
