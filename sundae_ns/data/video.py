@@ -136,7 +136,7 @@ def _facts(path: Path) -> tuple[int, float]:
     """Number of frames, which files state wrongly; and width of a pixel as a share of its height."""
     with _opened(path) as (container, video):
         aspect = float(video.sample_aspect_ratio or 1)
-        length = sum(packet.size > 0 for packet in container.demux(video))
+        length = sum(packet.size > 0 and not packet.is_discard for packet in container.demux(video))
     return length, aspect if 0.5 <= aspect <= 2 else 1.0  # no format of videos uses others
 
 

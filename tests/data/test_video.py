@@ -143,10 +143,15 @@ def test_the_sharpest_frame_of_each_stretch(tmp_path):
     assert left[:13] == [1 + 3 * number for number in range(13)]
 
 
-@pytest.mark.parametrize("name", ["a.mkv", "a.mts", "a.ts", "a.flv", "\udcff.mp4", "parts.mp4"])
+@pytest.mark.parametrize("name", ["a.mkv", "a.mts", "a.ts", "a.flv", "\udcff.mp4", "parts.mp4", "cut.mp4"])
 def test_frames_are_counted_where_no_length_is_stated_or_that_of_a_part(tmp_path, name):
     parts = {"movflags": "frag_keyframe+default_base_moof"} if name == "parts.mp4" else {}
     write_colours(tmp_path / name, 5 * [patches()], 1, options=parts, x264="keyint=2")
+    if name == "cut.mp4":  # by an edit list, as phones cut: 0.5 s of 0.9 s, where a frame takes 1,024 units
+        write_colours(tmp_path / name, 9 * [patches()], 1, x264="bframes=0")
+        content = bytearray((tmp_path / name).read_bytes())
+        struct.pack_into(">Ii", content, content.index(b"elst") + 12, 500, 4 * 1024)
+        (tmp_path / name).write_bytes(content)
     assert _facts(tmp_path / name) == (5, 1)
     assert len(frames_from(tmp_path / name)) == 5
 

@@ -144,8 +144,7 @@ def test_positions_are_rounded_once(tiny, scene, packed, tmp_path):
     exact, errors = scene.gaussians["means"].double(), []
     assert run("pack", tiny.folder, "-o", tmp_path / "targeted.sundae", "--max-mb", 10) == 0
     for file in (packed, tmp_path / "targeted.sundae"):
-        distances = torch.cdist(exact, read_scene(file).gaussians["means"].double())
-        errors.append(float(distances.amin(dim=1).max()))
+        errors.append(float(torch.cdist(exact, read_scene(file).gaussians["means"].double()).amin(dim=1).max()))
     assert errors[1] < errors[0] / 4  # three bits more
 
 

@@ -175,8 +175,7 @@ def test_cameras_of_a_capture_in_the_coordinates_of_a_run(capture, load, edit, t
     seen = {tuple(camera.center.tolist()) for camera in cameras_of(capture, scene)}
     trained = poses_of(made)[:, :, 3]
     nearest = torch.cdist(trained, torch.tensor(sorted(seen)))
-    limit = 1e-5 * max(1.0, float(trained.abs().max()))
-    assert float(nearest.min(dim=1).values.max()) < limit
+    assert float(nearest.min(dim=1).values.max()) < (1e-5 * max(1.0, float(trained.abs().max())))
 
 
 @pytest.mark.parametrize("robust", [True, False])

@@ -117,8 +117,7 @@ def test_continuous_pruning_and_densification_share_a_field(build, training_of):
             assert training.live()
         assert all(value.isfinite().all() for value in model.gauss_params.values())
         if model.state.pruning["pruned_at"] == step:
-            scales = model.gauss_params["scales"]
-            direction = training.optimizers.optimizers["scales"].state[scales]["exp_avg"]
+            direction = training.optimizers.optimizers["scales"].state[model.gauss_params["scales"]]["exp_avg"]
             # What was merged starts without one, and what stayed as it is keeps its own.
             assert 0 < int((direction == 0).all(dim=1).sum()) < model.num_points
         rows = [value for value in model.state.densification.values() if isinstance(value, Tensor) and value.ndim]

@@ -100,8 +100,7 @@ def test_a_full_disk_leaves_the_older_checkpoint(tmp_path, monkeypatch, older, r
 def test_nerfstudio_finds_its_newest_beside_a_killed_save(tmp_path):
     """nerfstudio's own commands read a step off every name in the folder."""
     saved(tmp_path, 10, 20)
-    killed = tmp_path / checkpoint._PARTIAL.format(os.getpid())
-    killed.write_bytes(b"half")
+    (tmp_path / checkpoint._PARTIAL.format(os.getpid())).write_bytes(b"half")
     assert sorted(int(x[x.find("-") + 1 : x.find(".")]) for x in os.listdir(tmp_path))[-1] == 20
     saved(tmp_path, 30)
     assert sorted(os.listdir(tmp_path)) == [name(10), name(20), name(30)]

@@ -15,8 +15,7 @@ def test_scores_by_hand():
     params, weights = gaussians(40), torch.arange(40.0).index_fill(0, torch.tensor([7]), torch.nan)
     expected = torch.arange(40.0).double().index_fill(0, torch.tensor([7]), 0)  # NaN counts as 0
     assert torch.equal(score(params, PruneRule(), None, weights), expected)
-    magnitude = response(params, PAPER)
-    torch.testing.assert_close(score(params, PAPER, None, None), magnitude.sqrt(), equal_nan=True)
+    torch.testing.assert_close(score(params, PAPER, None, None), response(params, PAPER).sqrt(), equal_nan=True)
     opacity = score(params, PruneRule(score=lambda given: given["opacities"].sigmoid().flatten()), None, None)
     torch.testing.assert_close(opacity, params["opacities"].sigmoid().flatten().double())
 

@@ -23,8 +23,7 @@ def scene_of(points, scale):
 
 def wall(n=4000):
     """Points of a square of side 4, which faces the views."""
-    generator = torch.Generator().manual_seed(0)
-    return (torch.rand(n, 3, generator=generator) - 0.5) * torch.tensor([4.0, 0.02, 4.0])
+    return (torch.rand(n, 3, generator=torch.Generator().manual_seed(0)) - 0.5) * torch.tensor([4.0, 0.02, 4.0])
 
 
 def planted(n=30):

@@ -271,8 +271,7 @@ def test_a_phone_draws_what_covers_most(decode, tmp_path, monkeypatch):
     file = write_kind(tmp_path / "a.sundae", KINDS["residual"])
     (found,), scene = decode(file), sn.load(file)
     assert (found["count"], found["total"]) == (20, len(scene))
-    covered = scene.opacities * scene.scales.sort(dim=1).values[:, 1:].prod(dim=1)
-    rows = covered.topk(20).indices.sort().values
+    rows = (scene.opacities * scene.scales.sort(dim=1).values[:, 1:].prod(dim=1)).topk(20).indices.sort().values
     for name in ("means", "features"):
         drawn = np.fromfile(f"{file}.{name}", np.float32).reshape(20, -1)
         np.testing.assert_allclose(drawn, scene.gaussians[name][rows], atol=1e-6)
