@@ -65,8 +65,7 @@ def newest_step(path: Path) -> int | None:
             path, _ = newest_whole(path)
         except CheckpointError:
             return None
-    match = _NAME.fullmatch(path.name)
-    return None if match is None else int(match[1])
+    return int(match[1]) if (match := _NAME.fullmatch(path.name)) else None
 
 
 def write(state: Mapping[str, Any], path: Path) -> None:

@@ -30,11 +30,15 @@ _BY_SUFFIX[".zip"] = "sog"
 _FIRST_BYTES: dict[bytes, Kind] = {b"\x89SUNDAE\n": "packed", b"ply\n": "ply", b"ply\r": "ply"}
 _FIRST_BYTES |= {b"\x1f\x8b": "spz", b"NGSP": "spz", b"PK\x03\x04": "sog", b"glTF": "glb"}
 _UNREAD = {
-    ".lcc": "is a scene of XGRIDS; convert it to .ply with SuperSplat or splat-transform",
+    **dict.fromkeys((".lcc", ".lcc2"), "is a scene of XGRIDS; convert it to .ply with SuperSplat or splat-transform"),
+    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "is a scene of OpenUSD; export its Gaussians as .ply or .glb"),
     ".rad": "is a scene of Spark; convert the .ply that it was made of",
     ".html": "is a web page; give the scene that it was made of",
     ".gltf": "is a glTF scene in several files; export it as .glb",
     ".pth": "is a checkpoint of another trainer; give its .ply, such as point_cloud/iteration_*/point_cloud.ply",
+    **dict.fromkeys(
+        (".rar", ".7z", ".tar", ".tgz", ".xz", ".zst"), "is an archive; unpack it, and give the scene in it"
+    ),
 }
 _READERS: dict[Kind | None, Callable[[Path], Any]] = {"spz": read_spz, "sog": read_sog, "glb": read_glb}
 _WRITERS: dict[str, Callable[..., None]] = {".spz": write_spz, ".sog": write_sog, ".glb": write_glb}

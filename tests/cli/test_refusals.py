@@ -75,6 +75,8 @@ REFUSALS = {
     "pack gone -o a.sundae --target-drop nan": "target-drop is nan",
     "pack gone -o a.sundae --target-drop 1 --max-mb 9": "exclude each other",
     "compare a.lcc in.ply -o out": "a.lcc is a scene of XGRIDS; convert it to .ply with",
+    "info a.usdz": "a.usdz is a scene of OpenUSD; export its Gaussians as .ply or .glb",
+    "info a.7z": "a.7z is an archive; unpack it, and give the scene in it",
     "compare in.ply -o out": "in.ply is one scene; give another, --formats, or --data with a capture",
     "compare in.ply --data none": "none does not exist; give the folder of the capture with --data",
     "compare in.ply -o used": "--overwrite",
@@ -153,7 +155,9 @@ def inputs(tmp_path_factory):
         (folder / name).write_bytes(header.replace(b"vertex 200", b"vertex %d" % count) + b"end_header\n" + nan)
     path = {"render_width": 41, "render_height": 31, "camera_path": []}
     contents = {"in.bin": b"\x1f\x8b\xff", "damaged.json": b"{", "few.json": json.dumps(path).encode()}
-    contents |= dict.fromkeys(("a.ksplat", "a.lcc", "a.glb", "a.pth", "a.splat", "page.html"), bytes(33))
+    contents |= dict.fromkeys(
+        ("a.ksplat", "a.lcc", "a.glb", "a.pth", "a.splat", "page.html", "a.7z", "a.usdz"), bytes(33)
+    )
     contents |= {"text.mp4": b"not a video", "trained/point_cloud/iteration_30000/point_cloud.ply": b""}
     contents["trained/point_cloud/iteration_7000/point_cloud.ply"] = b""  # written later
     empty = "scene/transforms.json", "model/sparse/0/cameras.bin", "blender/transforms_train.json", "used/thesis.txt"
