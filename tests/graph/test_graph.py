@@ -14,8 +14,7 @@ from sundae_ns.graph.graph import build_graph
 
 
 def dense(graph):
-    W = torch.zeros(graph.N, graph.N, dtype=graph.weights.dtype)
-    return W.scatter_add(1, graph.indices, graph.weights)
+    return torch.zeros(graph.N, graph.N, dtype=graph.weights.dtype).scatter_add(1, graph.indices, graph.weights)
 
 
 def edges(graph):

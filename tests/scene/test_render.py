@@ -21,8 +21,7 @@ VIEWER_KEYS = {"rgb": 3, "base_rgb": 3, "depth": 1, "accumulation": 1, "features
 @pytest.mark.parametrize("mode", ["residual", "features", "off"])
 @torch.no_grad()
 def test_every_output_can_be_shown(build, perturb, camera, mode, size):
-    model = perturb(build(head={"mode": mode})).eval()
-    outputs = model.get_outputs_for_camera(camera(*size))
+    outputs = perturb(build(head={"mode": mode})).eval().get_outputs_for_camera(camera(*size))
     shapes = {name: value.shape for name, value in outputs.items()}
     assert shapes == {name: (*size[::-1], count) for name, count in VIEWER_KEYS.items()}
     for name, value in outputs.items():
