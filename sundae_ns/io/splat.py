@@ -71,9 +71,9 @@ def read_splat(path: Path) -> dict[str, Tensor]:
     coordinates. Log-scales of widths of 0 are infinite; see ``gaussians.sanitise``.
     """
     with reading(path, "a complete .splat"):
-        if (content := regular(path).read_bytes()).isascii() and content:
-            raise ValueError("it is text")
-        rows = np.frombuffer(content, _SPLAT)
+        rows = np.frombuffer(content := regular(path).read_bytes(), _SPLAT)
+        if (content.isascii() and content) or (rows["widths"] < 0).any():
+            raise ValueError("it is text, or has negative widths")
     quats = (rows["quats"].astype(np.float32) - 128) / 128
     return _gaussians(rows, rows["means"], quats, np.zeros((len(rows), 0, 3)))
 

@@ -117,6 +117,7 @@ DAMAGED = {
         lambda path: path.write_text("<!DOCTYPE HTML>" + 49 * " "),
         "is a web page; download the f",
     ),
+    "an image": ("a.splat", lambda path: path.write_bytes(b"\xff\xd8\xff\xe1" * 16), "has negative widths"),
     "another text": ("a.splat", lambda path: path.write_text(64 * "a"), "it is text"),
     "a pointer of Git LFS": (
         "a.ply",
