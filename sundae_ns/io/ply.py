@@ -340,6 +340,9 @@ def read_ply(path: Path) -> dict[str, Tensor]:
 
     params = {name: _columns(rows, names) for name, names in columns.items() if name != "means"}
     params["means"] = _columns(rows, columns["means"], np.float64 if rows["x"].dtype.itemsize == 8 else np.float32)
+    activated = (params["scales"] > 0).all() & ((params["opacities"] - 0.5).abs() <= 0.5).all()
+    if len(rows) > 99 and bool(activated):  # no real scene has such logarithms and logits throughout
+        raise DataError(f"{path} has widths and opacities, not their logarithms and logits; export it again.")
     if is_flat:
         params["scales"] = torch.nn.functional.pad(params["scales"], (0, 1), value=-math.inf)
     if rows["opacity"].dtype.kind in "iu":  # a share, not a logit

@@ -153,8 +153,7 @@ def _encoded(arrays: Mapping[str, NDArray[np.float32]], marks: Marks) -> dict[st
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": color_values.tolist(), "files": ["sh0.webp"]},
     }
-    coefficients = arrays["features_rest"].shape[1]
-    if coefficients:
+    if coefficients := arrays["features_rest"].shape[1]:
         rows, labels = palette(arrays["features_rest"].reshape(n, -1))
         values, codes = codebook(rows.reshape(len(rows), coefficients, 3))
         padded = np.zeros((math.ceil(len(rows) / _ROW_ENTRIES) * _ROW_ENTRIES, coefficients, 3), np.uint8)

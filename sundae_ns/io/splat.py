@@ -56,8 +56,7 @@ def _gaussians(rows: NDArray[Any], means: NDArray[Any], quats: NDArray[Any], res
 
 def joined(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:
     """The Gaussians of all parts; ``ValueError`` if there are none, or if they differ in their SH degree."""
-    parts = [part for part in parts if len(part["means"])]
-    if not parts:
+    if not (parts := [part for part in parts if len(part["means"])]):
         raise ValueError("it has no Gaussians")
     if len({part["features_rest"].shape[1:] for part in parts}) > 1:
         raise ValueError("its parts have different SH degrees")

@@ -228,6 +228,7 @@ WRONG = {
     "Scaffold-GS": (_with("f_offset_0", "f_anchor_feat_0", without="f_"), "network for its colours .f_anchor_feat_0."),
     "features for colours": (_with("color_feature_0", without="f_"), "a network for its colours"),
     "lists": (_columns(_lists), "property corners of each vertex .* is a list"),
+    "widths": (_columns(lambda columns: dict.fromkeys(columns, np.full(200, 0.5, "f4"))), "not their logarithms"),
     "lists before": (_header(b"element", FACES % 1 + b"element"), "each face"),
     "a cut text": (lambda path: (_text(path), path.write_bytes(path.read_bytes()[:-400])), "it has 6|columns"),
     "no last coefficient": (_without("f_rest_8"), "8 f_rest"),
