@@ -74,7 +74,7 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """Term beside SSIM: l1 is the paper's; rms, the root of the mean squared error, gains 0.1 to 0.3 dB."""
     prior_after_prune: float = 0.3  # Weight of opacities and scales in the loss once pruned, over the number of images
     average_share: float = 0.1  # Last share of the schedule over which weights are averaged; 0.1 gains 0.2 dB
-    drop_rate: float | None = None  # Share that steps after the prune leave out; None: 0.2 of few photos, 0.1 by trials
+    drop_rate: float | None = None  # Share left out after the prune: 0.2 below 32 photos, 0.1 where counts are tried
     exposure_compensation: Literal["auto", "on", "off"] = "auto"
     """Even out photos of changing exposure or white balance with their neighbours; auto does if half of them differ."""
     dense_start_views: int = 300
