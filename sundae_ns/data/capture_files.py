@@ -33,7 +33,7 @@ Advance = Callable[[int], None]  # called with the number of further parts of a 
 class Placed(NamedTuple):
     """Names of the photos of a capture in their order, and what :func:`.find_poses` reports of them."""
 
-    placed: tuple[str, ...]
+    placed: Mapping[str, str]  # by the paths of their images in the capture
     left_out: tuple[str, ...]  # those without a pose
     cameras: int = 1
     error: float = 0.0  # mean reprojection error, pixels
@@ -55,8 +55,8 @@ class Placed(NamedTuple):
         """What to photograph again, as the end of a sentence."""
         if not self.placed or not self.left_out:
             return "add sharp photos that overlap by two thirds"
-        order = {name: index for index, name in enumerate(sorted([*self.placed, *self.left_out]))}
-        gaps = [(abs(order[a] - order[b]), order[b], order[a], a, b) for a in self.placed for b in self.left_out]
+        at = {name: index for index, name in enumerate(sorted([*self.placed.values(), *self.left_out]))}
+        gaps = [(abs(at[a] - at[b]), at[b], at[a], a, b) for a in self.placed.values() for b in self.left_out]
         *_, near, lost = min(gaps)
         return f"photograph the way from {near} to {lost} again, sharp and in steps that overlap by two thirds"
 
@@ -67,8 +67,8 @@ def placed_in(capture: Path) -> Placed:
     frames, left_out = meta.get("frames"), meta.get("left_out", [])
     if not isinstance(frames, list) or not isinstance(left_out, list):
         raise DataError(f"{path} lists no frames; remove it to make it again")
-    stated = [frame.get("original", frame.get("file_path", "")) if isinstance(frame, dict) else "" for frame in frames]
-    return Placed(tuple(map(str, stated)), tuple(map(str, left_out)))
+    paths = {str(frame.get("file_path")): frame for frame in frames if isinstance(frame, dict)}
+    return Placed({path: str(frame.get("original", path)) for path, frame in paths.items()}, tuple(map(str, left_out)))
 
 
 def names_of(photos: Sequence[Photo]) -> list[str]:

@@ -82,8 +82,8 @@ class Opened:
 
     @property
     def scene(self) -> str:
-        """Name of the capture's folder."""
-        return (self.capture.parent if self.capture.suffix == ".json" else self.capture).resolve().name
+        """Name of the capture's folder, or of the one around it that ``sundae run`` has made."""
+        return next(part for part in self.capture.resolve().parts[::-1] if part != "capture" and part[-5:] != ".json")
 
 
 @usual_defaults()

@@ -24,6 +24,7 @@ from sundae_ns.core.metrics import MOST_PSNR, Lpips, ViewQuality, quality_of
 from sundae_ns.core.tables import MEGABYTE, number, table, without_nan
 from sundae_ns.core.timing import median_ms
 from sundae_ns.cuda.kernels import naming_full_memory
+from sundae_ns.data.capture_files import TRANSFORMS, placed_in
 from sundae_ns.head.head import bytes_of_module
 from sundae_ns.scene.compose import aligned
 from sundae_ns.scene.describe import bytes_at, held_out_cameras
@@ -139,12 +140,14 @@ class Subject:
     @classmethod
     def of_run(cls, opened: Opened) -> Subject:
         """A run, or a file in the test views of a capture."""
-        model, names = opened.model, ("scene", "method", "variant", "seed", "steps", "prune_s")
-        facts: dict[str, Any] = {name: getattr(opened, name) for name in names}
-        facts |= {"source": str(opened.source), "keep_ratio": opened.kept}
-        facts["peak_primitives"] = model.state.pruning["peak"] or None
+        model, known = opened.model, ("scene", "method", "variant", "seed", "steps", "prune_s")
+        facts: dict[str, Any] = {name: getattr(opened, name) for name in known}
+        peak = model.state.pruning["peak"] or None
+        facts |= {"source": str(opened.source), "keep_ratio": opened.kept, "peak_primitives": peak}
         settings, cameras = model.render_settings(training=False), [model.camera_of(each) for each in opened.cameras]
-        photos = [path.name for path in opened.datamanager.eval_dataset.image_filenames]
+        stated = placed_in(opened.capture).placed if (opened.capture / TRANSFORMS).is_file() else {}
+        images = opened.datamanager.eval_dataset.image_filenames
+        photos = [Path(stated.get(f"images/{path.name}", path.name)).name for path in images]
         views = (cameras, opened.truths, photos, facts, str(opened.capture.resolve()))
         return cls(model.source, settings, model._get_background_color(), *views, opened.packed_bytes)
 
@@ -238,7 +241,7 @@ def measure(
     lpips: Lpips | None = None,
     warmup: int = 3,
     repeats: int = 5,
-    progress: Callable[[], object] | None = None,
+    progress: Callable[[], object] = lambda: None,
     command: str = "",
 ) -> Measured:
     """Evaluate and time a scene in its views, with the head and without; ``label`` is its name in tables.
@@ -259,8 +262,7 @@ def measure(
                 times[name].append(time(partial(subject.image, i, head=on)))
         if repeats:
             times["head"].append(subject.head_ms(i, time))
-        if progress is not None:
-            progress()
+        progress()
     bare = bytes_of({name: value for name, value in gaussians.items() if name != FEATURES})
     # A disabled head is not needed, and neither are its features. A file is read completely in any case.
     stored = (bare if head is None else bytes_of(gaussians), bytes_of_module(head))

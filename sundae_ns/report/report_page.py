@@ -113,8 +113,7 @@ def shown_view(
 
 
 def _plain(image: Tensor) -> Tensor:
-    # A damaged scene may render NaN.
-    return image.detach().to(device="cpu", dtype=torch.float32).nan_to_num(nan=0.0).clamp(0, 1)
+    return image.detach().to(device="cpu", dtype=torch.float32).nan_to_num(nan=0.0).clamp(0, 1)  # of a damaged scene
 
 
 def _image(image: Tensor, size: tuple[int, int]) -> Image.Image:
@@ -125,8 +124,7 @@ def _image(image: Tensor, size: tuple[int, int]) -> Image.Image:
 def _encoded(image: Image.Image) -> str:
     """An image as a ``data:`` address: PNG if it has a palette, else WebP."""
     file, kind = BytesIO(), "png" if image.mode == "P" else "webp"
-    quality = {"lossless": True} if max(image.size) <= EXACT_SIDE else {"quality": 90}
-    image.save(file, kind, optimize=True, **quality)
+    image.save(file, kind, optimize=True, lossless=max(image.size) <= EXACT_SIDE, quality=90)
     return f"data:image/{kind};base64,{base64.b64encode(file.getvalue()).decode()}"
 
 

@@ -73,8 +73,8 @@ def test_frames_name_their_photos_in_order(tmp_path):
     meta = transforms(made)
     assert [meta[name] for name in ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1")] == [50, 50, 20, 15, 0.01, 0, 0]
     path = tmp_path / "transforms.json"
-    path.write_text(json.dumps({"frames": [{"original": "b"}, {"file_path": "images/c"}], "left_out": ["a"]}))
-    assert placed_in(tmp_path) == Placed(("b", "images/c"), ("a",))
+    path.write_text('{"frames": [{"file_path": "a", "original": "b"}, {"file_path": "c"}], "left_out": ["a"]}')
+    assert placed_in(tmp_path) == Placed({"a": "b", "c": "c"}, ("a",))
     for text in ('{"frames": 3}', '{"frames": [], "left_out": 2}', '{"frames": [{}, {}', "[]"):
         path.write_text(text)
         refused(placed_in, tmp_path)
@@ -92,7 +92,7 @@ def test_frames_name_their_photos_in_order(tmp_path):
     ],
 )
 def test_what_to_photograph_again(placed, left_out, enough, again):
-    photos = Placed(tuple(placed), tuple(left_out))
+    photos = Placed(dict(enumerate(placed)), tuple(left_out))
     assert (photos.total, photos.enough) == (len(placed + left_out), enough)
     assert again in photos.again
 

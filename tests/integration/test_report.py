@@ -77,6 +77,10 @@ def test_a_capture_that_has_moved_is_found_or_named(tiny, tmp_path):
     assert load_model(run, data=tiny.scene).capture == tiny.scene
     shutil.copytree(tiny.scene, capture)
     assert load_model(run).capture == capture
+    stated = shutil.copytree(capture, tmp_path / "garden/capture") / "transforms.json"  # as sundae run writes it
+    stated.write_text(stated.read_text().replace('"file_path"', '"original": "IMG 1.HEIC", "file_path"'))
+    subject = Subject.of_run(load_model(run, data=stated.parent))
+    assert ({*subject.names}, subject.facts["scene"]) == ({"IMG 1.HEIC"}, "garden")
 
 
 def test_figures_of_a_run(opened):

@@ -223,8 +223,7 @@ def test_a_changed_field_is_scored_anew(calls):
     assert not torch.equal(first, second)
     other, _ = build(70)
     model.load_state_dict(other.state_dict())
-    third = shown(model, "as configured", 0.2)
-    assert third.shape == (70,)
+    assert shown(model, "as configured", 0.2).shape == (70,)
     assert calls == [N, N, 70]
     assert cameras.asked == 1
 

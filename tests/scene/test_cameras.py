@@ -260,8 +260,7 @@ def test_a_frame_is_a_transform_and_a_scale():
 
 @torch.no_grad()
 def test_a_primitive_lands_where_the_pinhole_says(build, camera):
-    xyz = torch.tensor([[0.55, 0.35, 0.0]])
-    model = build(seed_points=(xyz, torch.zeros(1, 3, dtype=torch.uint8))).eval()
+    model = build(seed_points=(torch.tensor([[0.55, 0.35, 0.0]]), torch.zeros(1, 3, dtype=torch.uint8))).eval()
     model.gauss_params["scales"].data.fill_(-5)
     row, column = divmod(int(model.get_outputs_for_camera(camera())["accumulation"][..., 0].argmax()), 40)
     # In front of the camera by 3; x to the right, y up, pixel centres at one half.

@@ -95,11 +95,9 @@ def test_files_of_other_programs_start_a_model(build, training_of, tmp_path, nam
         caplog.clear()
         options["warm_start_frame"] = "capture"
     model = build(**options)
-    expected = similarity(given, *_frame())["means"]
-    torch.testing.assert_close(model.means.detach(), expected, rtol=0, atol=0.001)
+    torch.testing.assert_close(model.means.detach(), similarity(given, *_frame())["means"], rtol=0, atol=0.001)
     assert model.gauss_params["scales"].isfinite().all()
-    sanitised = [message for message in caplog.messages if "clamped" in message]
-    assert len(sanitised) == (name != "a.compressed.ply")
+    assert len([message for message in caplog.messages if "clamped" in message]) == (name != "a.compressed.ply")
 
 
 def test_a_finished_run_opens_without_what_it_started_from(build, training_of, tmp_path, capsys):
