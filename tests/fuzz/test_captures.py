@@ -149,8 +149,7 @@ def test_valid_models_are_read(capture):
     torch.testing.assert_close(clouds[0], clouds[1], atol=1e-6, rtol=0)
     (capture / "sparse" / "0" / "points3D.txt").unlink()
     assert "points3D_xyz" not in load(capture, colmap=True).train_dataset.metadata
-    first = next((capture / "images").iterdir())
-    (capture / "images" / "an image.png").write_bytes(first.read_bytes())
+    (capture / "images" / "an image.png").write_bytes(next((capture / "images").iterdir()).read_bytes())
     as_text(capture)
     assert "an image.png" in {path.name for path in load(capture, colmap=True).train_dataset.image_filenames}
 

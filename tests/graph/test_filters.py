@@ -108,8 +108,7 @@ def test_a_constant_is_smooth_and_what_changes_from_node_to_node_is_not():
 def test_a_node_without_an_edge_keeps_its_value():
     graph = build_graph(torch.cat([cloud(), torch.tensor([[1e3, 0, 0], [0, 1e3, 0]])]), num_neighbors=6)
     assert graph.isolated.tolist()[-2:] == [True, True]
-    known = np.arange(62) < 61
-    smooth = Smoother(graph, 8.0)(np.full((62, 1), 2.0), known)
+    smooth = Smoother(graph, 8.0)(np.full((62, 1), 2.0), np.arange(62) < 61)
     assert smooth[60] == pytest.approx(2.0)
     assert smooth[61] == 0
     graph, signal = build_graph(cloud(5), num_neighbors=2, tau=0.0), cloud(5, seed=1).numpy()  # no edges at all

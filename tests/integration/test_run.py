@@ -61,8 +61,7 @@ def test_photos_to_a_report_with_an_interruption(run, monkeypatch, capfd):
     assert not Path("out/scene.sundae").exists()
 
     assert run(*words) == 0
-    said = capfd.readouterr().out
-    assert f"Resuming after step {STOP_AT}" in said
+    assert f"Resuming after step {STOP_AT}" in capfd.readouterr().out
     assert [path.name for path in folder.glob("*/*.ckpt")] == [f"step-{STEPS - 1:09d}.ckpt"]
     (prune,) = json.loads((folder / "prune.json").read_text())
     assert prune["after"] == round(prune["before"] / 2)

@@ -1,5 +1,6 @@
 """Steps that a recording would replay, run kernel by kernel on the CPU, beside nerfstudio's."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -60,6 +61,13 @@ GROWTH = {
     "stop_screen_size_at": 100,
 }
 """Options that let the field grow every other step until it is pruned after step 9."""
+
+
+def test_steps_that_leave_out_another_share_are_another_recording(both):
+    _, recorded = both()
+    model, inputs = recorded.model, recorded.model.step_inputs(recorded.camera, recorded.batch)
+    each = (replace(model.render_settings(training=True), drop_rate=rate) for rate in (0.0, 0.1))
+    assert len({capture._kind(model.state, inputs, settings) for settings in each}) == 2
 
 
 @pytest.mark.parametrize(

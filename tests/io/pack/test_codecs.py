@@ -59,8 +59,7 @@ def test_positions(kind, n, seed):
     half = (packed.high.astype(np.float64) - packed.low) / (2**bits - 1) / 2
     block = np.arange(n) // size
     assert (np.abs(found - x[order]) <= half[block] * (1 + 1e-9) + ulp(x[order])).all()
-    starts = np.arange(1, n) % size == 0
-    assert ((packed.codes[1:] >= packed.codes[:-1]) | starts).all()
+    assert ((packed.codes[1:] >= packed.codes[:-1]) | (np.arange(1, n) % size == 0)).all()
     assert (packed.codes < np.uint64(1 << 3 * bits)).all()
 
 
