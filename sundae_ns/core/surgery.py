@@ -24,8 +24,8 @@ def check_wiring(params: Mapping[str, Tensor], optimizers: Optimizers) -> None:
     for name, value in params.items():
         if not per_gaussian(value, n):
             raise DataError(f"parameter {name!r} has shape {list(value.shape)} for {n} Gaussians: resize it")
-        groups = optimizers[name].param_groups if name in optimizers else []
-        if groups and [id(held) for group in groups for held in group["params"]] != [id(value)]:
+        groups = optimizers[name].param_groups if name in optimizers else None
+        if groups is not None and [id(held) for group in groups for held in group["params"]] != [id(value)]:
             raise DataError(f"the optimizer of {name!r} holds another tensor: build it from params[{name!r}]")
 
 

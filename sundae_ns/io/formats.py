@@ -36,9 +36,7 @@ _UNREAD = {
     ".html": "is a web page; give the scene that it was made of",
     ".gltf": "is a glTF scene in several files; export it as .glb",
     ".pth": "is a checkpoint of another trainer; give its .ply, such as point_cloud/iteration_*/point_cloud.ply",
-    **dict.fromkeys(
-        (".rar", ".7z", ".tar", ".tgz", ".xz", ".zst"), "is an archive; unpack it, and give the scene in it"
-    ),
+    **dict.fromkeys(".rar .7z .tar .tgz .xz .zst".split(), "is an archive; unpack it, and give the scene in it"),
 }
 _READERS: dict[Kind | None, Callable[[Path], Any]] = {"spz": read_spz, "sog": read_sog, "glb": read_glb}
 _WRITERS: dict[str, Callable[..., None]] = {".spz": write_spz, ".sog": write_sog, ".glb": write_glb}

@@ -90,11 +90,12 @@ def prunes_before(path: Path, step: int) -> list[dict[str, Any]]:
 
     A file that cannot be read is renamed to ``*.damaged.json``, because it should not end a training.
     """
-    with suppress(FileNotFoundError):
-        try:
-            return [record for record in json.loads(regular(path).read_text(encoding="utf-8")) if record["step"] < step]
-        except (ValueError, TypeError, KeyError):
-            path.replace(path.with_suffix(".damaged.json"))
+    try:
+        return [record for record in json.loads(regular(path).read_text(encoding="utf-8")) if record["step"] < step]
+    except FileNotFoundError:
+        pass
+    except (ValueError, TypeError, KeyError):
+        path.replace(path.with_suffix(".damaged.json"))
     return []
 
 

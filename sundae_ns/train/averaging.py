@@ -89,7 +89,6 @@ class Averaging(Callback):
     def __init__(self, share: float, settled_at: float) -> None:
         self.share, self.settled_at = share, settled_at
         self._mean = RunningMean()
-        self._end = 0  # Last step of the schedule
         self._restored = 0  # Returns to a snapshot that the field had made when the mean began
         self._replaced: dict[str, Tensor] = {}  # Weights of the last step, from which a longer training goes on
         self._alone = True
@@ -107,8 +106,8 @@ class Averaging(Callback):
         """Put back the weights that a mean has replaced, so that two trainings end as one of their length."""
         state, length, last = run.state, run.schedule_length, run.last_step
         if length is not None and last is not None:
-            self._end = max(last, length - 1)  # a part that ends earlier ends with its own weights
-            state.averages_from = max(self._end - self.share * length, self.settled_at - state.offset)
+            end = max(last, length - 1)  # a part that ends earlier ends with its own weights
+            state.averages_from = max(end - self.share * length, self.settled_at - state.offset)
         self._alone = run.images_per_step == 1
         if self._alone:
             RunningMean(self._replaced, 1).replace(weights_of(state))
@@ -129,5 +128,5 @@ class Averaging(Callback):
         if replaced:
             log.info(f"step {state.step}: the weights are the mean of {self._mean.count} of the last steps")
             self._replaced = replaced if self._alone else {}
-            if last == self._end:  # after a part, the mean goes on with the rest of the run
+            if last >= run.schedule_length - 1:  # after a part, the mean goes on with the rest of the run
                 self._mean = RunningMean()

@@ -119,7 +119,8 @@ def fault(value: Any, schema: Mapping[str, Any], prefix: str = "") -> str | None
     # The first error only: own keywords come last in a schema, and rely on those before.
     if (error := next(_Validator(schema).iter_errors(value), None)) is None:
         return None
-    keys = [*filter(None, [prefix]), *map(str, error.absolute_path)]
+    keys = [prefix] if prefix else []
+    keys += map(str, error.absolute_path)
     if error.validator == "required":
         keys.append(next(key for key in error.validator_value if key not in error.instance))
     return ".".join(keys)
