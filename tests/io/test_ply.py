@@ -117,7 +117,7 @@ def test_other_forms_are_the_same_gaussians(tmp_path, form):
         assert torch.equal(read_point_cloud(tmp_path / "b.ply")[0], params["means"][5:])
 
 
-@pytest.mark.parametrize("name", ["filter_3D", "filter_3d"])
+@pytest.mark.parametrize("name", ["filter_3D", "3d_filter", "mip_filter3D_0"])
 def test_the_filter_of_mip_splatting_is_fused_and_never_stale(tmp_path, name):
     """As its ``get_scaling_with_3D_filter`` and ``get_opacity_with_3D_filter``."""
     params, path, n = small_field(9), tmp_path / "a.ply", 9
@@ -152,10 +152,10 @@ def test_2dgs_is_flat_and_opacities_of_bytes_are_shares(tmp_path):
     torch.testing.assert_close(opacities, torch.tensor([0, 0.2, 0.4, 0.8, 1]), atol=2e-6, rtol=0)
 
 
-ANTIALIASED = (
-    "anti-aliased = on|AntiAliasing: 1.0|antialias: yes|Antialiased|rasterize_mode mip|train_flags --antialiasing"
-)
-UPWARDS = "up: 0 0 2|upAxis=Z|Up vector [0, 0, 1]|UP_DIRECTION (0; 0; 1)|vertical axis: z-up|Vertical Axis: z"
+ANTIALIASED = """anti-aliased = on|AntiAliasing: 1.0|antialias: yes|Antialiased|rasterize_mode mip|--antialiasing|\
+train_flags: --antialiasing --eval|antialiasing = True # 3dgs|mip-splatting: 1|SplatRenderMode: MipSplatting"""
+UPWARDS = """up: 0 0 2|upAxis=Z|Up vector [0, 0, 1]|UP_DIRECTION (0; 0; 1)|vertical axis: z-up|world_up 0 0 1 (ENU)|\
+z-up|Vertical axis: z (x east, y north)|up_axis: "z"|Coordinate system: Z up, right-handed|worldUpVec=0,0,1"""
 ALL_MARKS = Marks(True, True, (0.6, 0.0, 0.8), (1e6 / 3, 0.1, -4e6))
 
 
@@ -224,11 +224,14 @@ WRONG = {
     "2DGS without rotations": (_without("scale_2", "rot_0"), "lacks scale_2, rot_0"),
     "Spacetime Gaussians": (_with("trbf_center", "motion_0"), "holds 4D Gaussians"),
     "4D Gaussians with a time": (_with("t"), "holds 4D Gaussians"),
+    "4D Gaussians by their scales": (_with("scale_3"), "holds 4D Gaussians .scale_3."),
+    "Student's t": (_with("nu_degree"), "Gaussians of another kernel .nu_degree."),
     "Brush's 4D": (_header(b"end_header", b"element delta_vertex_0 0\nproperty uchar x\nend_header"), "holds 4D"),
     "Scaffold-GS": (_with("f_offset_0", "f_anchor_feat_0", without="f_"), "network for its colours .f_anchor_feat_0."),
     "features for colours": (_with("color_feature_0", without="f_"), "a network for its colours"),
     "lists": (_columns(_lists), "property corners of each vertex .* is a list"),
     "widths": (_columns(lambda columns: dict.fromkeys(columns, np.full(200, 0.5, "f4"))), "not their logarithms"),
+    "shares": (_columns(lambda c: dict.fromkeys(c, np.zeros(200)) | {"opacity": np.linspace(0, 1, 200)}), "not their"),
     "lists before": (_header(b"element", FACES % 1 + b"element"), "each face"),
     "a cut text": (lambda path: (_text(path), path.write_bytes(path.read_bytes()[:-400])), "it has 6|columns"),
     "no last coefficient": (_without("f_rest_8"), "8 f_rest"),
