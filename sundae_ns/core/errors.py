@@ -94,7 +94,7 @@ def reading(
     except SundaeError:
         raise
     except Exception as error:
-        said, of_system = getattr(error, "strerror", None) or one_line(error), isinstance(error, OSError)
+        said, of_system = getattr(error, "strerror", None) or one_line(error), isinstance(error, OSError) and error.errno
         what = f"cannot be read ({said}); {missing}" if of_system else f"is not {kind} ({said}); {remedy}"
         with suppress(OSError, ValueError), regular(path).open("rb") as file:
             first = file.read(32).lower()

@@ -41,7 +41,7 @@ from sundae_ns.io.spz import decoded
 EXTENSION = "KHR_gaussian_splatting"
 _SPZ = EXTENSION + "_compression_spz_2"
 _INSTANCING, _VISIBILITY = "EXT_mesh_gpu_instancing", "KHR_node_visibility"
-_KNOWN = {EXTENSION, _SPZ, _INSTANCING, _VISIBILITY, "KHR_mesh_quantization", "glTF 2.0"}
+_KNOWN = {EXTENSION, _SPZ, _INSTANCING, _VISIBILITY, "KHR_mesh_quantization", "glTF 2.0", "glTF 2"}
 _SRGB = "srgb_rec709_display"
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
@@ -119,7 +119,8 @@ def read_glb(path: Path) -> tuple[dict[str, Tensor], Marks]:
     with reading(path, "a complete .glb with Gaussians", remedy="export it again, or as .ply"):
         try:
             document, binary = _chunks(path)
-            for name in (*document.get("extensionsRequired", []), f"glTF {document['asset'].get('minVersion', 2.0)}"):
+            versions = [document["asset"].get("minVersion", 2.0), str(document["asset"].get("version", 2))[:1]]
+            for name in (*document.get("extensionsRequired", []), *(f"glTF {version}" for version in versions)):
                 if name not in _KNOWN:
                     raise ValueError(f"it requires {name}, which is not known here")
             stated = [document["asset"].get("extras", {}).get(_OURS, {}).get(name) for name in _MARKS]
@@ -178,8 +179,7 @@ def _primitives(document: Json, binary: memoryview) -> Iterator[tuple[Json, Tran
     for i, (node, _) in enumerate(shown):
         visit(node.get("children", []), i)
     transforms = _below_parents([node for node, _ in shown]) if shown else np.empty((0, 4, 4))
-    by_mesh: dict[int, list[Transforms]] = {}
-    instances = 0
+    by_mesh, instances = dict[int, list[Transforms]](), 0
     for i, (node, parent) in enumerate(shown):
         transforms[i] = transforms[parent] @ transforms[i] if parent >= 0 else transforms[i]
         if "mesh" in node:
@@ -231,8 +231,8 @@ def _read_primitive(document: Json, binary: memoryview, primitive: Json) -> tupl
     compressed = extension.get("extensions", {})
     if compressed.keys() == {_SPZ}:  # with the values of the attributes, as CesiumJS reads it
         return decoded(bytes(_view(document, binary, compressed[_SPZ]["bufferView"])), "LUF")
-    if compressed or extension.get("kernel", "ellipse") != "ellipse":
-        raise ValueError(f"its Gaussians are compressed ({', '.join(compressed)}), or of another kernel")
+    if compressed or extension.get("kernel", "ellipse") != "ellipse" or primitive.keys() & {"indices", "targets"}:
+        raise ValueError(f"its Gaussians are compressed ({', '.join(compressed)}), indexed, or of another kernel")
     if extension.get("colorSpace", _SRGB) != _SRGB:
         raise ValueError(f"its colours are in {extension['colorSpace']!r}")
     attributes = primitive["attributes"]

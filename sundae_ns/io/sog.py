@@ -192,7 +192,7 @@ def read_sog(path: Path) -> tuple[dict[str, Tensor], Marks]:
 
 def _scene(path: Path, entry: Entry, size: int) -> tuple[dict[str, Tensor], Marks]:
     meta = parsed_json(entry(META))
-    if (version := meta.get("version", 1)) != 2:
+    if (version := str(meta.get("version", 1))) != "2":
         raise DataError(f"{path} has version {version} of the format; convert it with splat-transform to version 2")
     up, offset = (vector(" ".join(map(str, meta.get(name, ())))) for name in ("up", "offset"))
     antialiased = any(str(meta.get(name)).lower() in ANTIALIASED for name in ("antialias", "model"))
@@ -201,7 +201,7 @@ def _scene(path: Path, entry: Entry, size: int) -> tuple[dict[str, Tensor], Mark
 
 def _finest_level(path: Path, entry: Entry, size: int) -> tuple[dict[str, Tensor], Marks]:
     meta = parsed_json(entry(STREAMED))
-    if (version := meta.get("version", 1)) != 1:
+    if (version := str(meta.get("version", 1))) != "1":
         raise DataError(f"{path} has version {version} of streamed SOG, this program reads 1; update it")
     files, nodes = dict[str, list[tuple[int, int]]](), [meta["tree"]]
     while nodes:
@@ -210,7 +210,7 @@ def _finest_level(path: Path, entry: Entry, size: int) -> tuple[dict[str, Tensor
         if levels := node.get("lods"):
             finest = levels[min(levels, key=int)]
             files.setdefault(meta["filenames"][finest["file"]], []).append((finest["offset"], finest["count"]))
-    if "environment" in meta:
+    if meta.get("environment"):
         files[meta["environment"]] = []
     parts, marks, unpacked = list[dict[str, Tensor]](), Marks(), 0
     for file, leaves in files.items():
@@ -231,8 +231,8 @@ def _finest_level(path: Path, entry: Entry, size: int) -> tuple[dict[str, Tensor
 
 
 def _file_entry(folder: Path, name: str) -> bytes:
-    if Path(name).is_absolute() or ".." in Path(name).parts:
-        raise ValueError(f"{name} lies elsewhere")
+    if Path(name).is_absolute() or ".." in Path(name).parts or not (folder / name).exists():
+        raise ValueError(f"{name} is missing, or lies elsewhere")
     return regular(folder / name).read_bytes()
 
 

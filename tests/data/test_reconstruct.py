@@ -151,7 +151,7 @@ def test_masks_reach_the_capture_beside_a_broken_photo(colmap, photos, tmp_path)
     colmap.models, said = [6], []
     found, _ = find(photos, said.append, masks=tmp_path / "masks")
     assert (found.masks, found.left_out) == ("6 of 6", ("7.JPG",))
-    assert "1.JPG cannot be read" in said[0]
+    assert "1.JPG is not a photo that can be decoded" in said[0]
     frames = check_transforms(tmp_path / "capture" / "transforms.json")["frames"]
     assert frames[1]["mask_path"] == "masks/frame_00003.png"
     with Image.open(tmp_path / "capture" / "masks" / "frame_00003.png") as stored:

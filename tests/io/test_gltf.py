@@ -202,6 +202,8 @@ HOSTILE = {
     "a part of the harmonics": ({f"{SHARED}:SH_DEGREE_1_COEF_2": GONE}, "have no .*DEGREE_1_COEF_2"),
     "SH degree 5": ({f"{PRIMITIVE}/attributes": lambda given: given | dict.fromkeys(semantics(5), 0)}, "35 SH"),
     "a later version": ({"asset/minVersion": "2.1"}, "it requires glTF 2.1"),
+    "another version": ({"asset/version": "3.0"}, "it requires glTF 3"),
+    "some of its Gaussians": ({f"{PRIMITIVE}/indices": 0}, "Gaussians are .* indexed"),
     "a negative scene": ({"scene": -1}, "-1 is no index"),
     "nothing shown": ({"nodes": [{"children": [1], **HIDDEN}, {"mesh": 0}]}, "no mesh of its scene has"),
     "an unknown requirement": ({"extensionsRequired": ["KHR_new"]}, "it requires KHR_new"),

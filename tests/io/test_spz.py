@@ -74,7 +74,7 @@ HOSTILE = {
     "fewer bytes than Gaussians": (lambda: spz(FIELD, 3, count=101), "bytes are missing"),
     "SH degree 5": (lambda: spz(FIELD, 3, degree=5), "35 SH coefficients"),
     "a cut stream": (lambda: spz(FIELD, 3)[:-9], "ended before"),
-    "a wrong checksum": (lambda: spz(FIELD, 3)[:-8] + bytes(8), "CRC"),
+    "a wrong checksum": (lambda: spz(FIELD, 3)[:-8] + bytes(8), "CRC.*; export it again"),
     "a lower SH degree": (lambda: spz(FIELD, 3, degree=0), "unpacks to more"),
     "levels of detail": (lambda: spz(FIELD, 4)[:14] + b"\x80" + spz(FIELD, 4)[15:], "b'NGSP' 4 128, is not that"),
     "version 5": (lambda: spz(FIELD, 5), "version 1 to 4"),
