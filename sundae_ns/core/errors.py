@@ -94,8 +94,8 @@ def reading(
     except SundaeError:
         raise
     except Exception as error:
-        said, of_system = getattr(error, "strerror", None) or one_line(error), isinstance(error, OSError) and error.errno
-        what = f"cannot be read ({said}); {missing}" if of_system else f"is not {kind} ({said}); {remedy}"
+        said, system = getattr(error, "strerror", None) or one_line(error), isinstance(error, OSError) and error.errno
+        what = f"cannot be read ({said}); {missing}" if system else f"is not {kind} ({said}); {remedy}"
         with suppress(OSError, ValueError), regular(path).open("rb") as file:
             first = file.read(32).lower()
             what = next((other for begin, other in _STAND_INS.items() if first.startswith(begin)), what)
