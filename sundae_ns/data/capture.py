@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import unicodedata
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -166,10 +167,11 @@ def check_first_image(path: Path, meta: Mapping[str, Any], factor: int) -> None:
 
 
 def beside(path: Path) -> str:
-    """A remark on a file with another case or suffix than a missing one: `` (there is x.PNG)``; empty without one."""
-    wanted = (path.stem.lower(), path.name.lower())
-    names = [entry.name for entry in entries(path.parent) if entry.stem.lower() in wanted]
-    return "" if path.name in names or not names else f" (there is {names[0]})"
+    """A remark on a file of another case, suffix or Unicode form than a missing one: `` (there is x.PNG)``; or ""."""
+    wanted = [unicodedata.normalize("NFC", name).lower() for name in (path.stem, path.name)]
+    names = [one.name for one in entries(path.parent) if unicodedata.normalize("NFC", one.stem).lower() in wanted]
+    found = "" if path.name in names or not names else names[0]
+    return found and f" (there is {found if found.isascii() else ascii(found)})"
 
 
 def entries(folder: Path) -> list[Path]:

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -52,14 +52,14 @@ class ColmapImage(NamedTuple):
     camera: ColmapCamera
 
 
-def read_images(model: Path) -> dict[int, ColmapImage]:
+def read_images(model: Path, kinds: Sequence[str] = ("txt", "bin")) -> dict[int, ColmapImage]:
     """The images of a model by their numbers, with their cameras; ``DataError`` names the first unusable entry."""
     if not model.is_dir():
         raise DataError(f"{model} is not a folder; give that of the model with colmap --colmap-path (usually sparse/0)")
-    if (kind := next((kind for kind in ("txt", "bin") if (model / f"cameras.{kind}").exists()), None)) is None:
+    if not (present := [kind for kind in kinds if (model / f"cameras.{kind}").exists()]):
         near = beside(model / "cameras.bin")
         raise DataError(f"{model} holds neither cameras.bin nor cameras.txt{near}; give --colmap-path another folder")
-    cameras: dict[int, ColmapCamera] = {}
+    kind, cameras, images, numbers = present[0], dict[int, ColmapCamera](), dict[int, ColmapImage](), dict[str, int]()
     with _content(model / f"cameras.{kind}") as content:
         for number, name, width, height, params in _cameras(content, kind == "txt"):
             where = f"{model / f'cameras.{kind}'}, camera {number}"
@@ -72,8 +72,6 @@ def read_images(model: Path) -> dict[int, ColmapImage]:
                 finite(value, f"parameter {name}", where, positive=name.startswith("f"))
             size = side(width, "width", where), side(height, "height", where)
             cameras[number] = ColmapCamera(*size, *colmap_lens(lens, params, where))
-    images: dict[int, ColmapImage] = {}
-    numbers: dict[str, int] = {}
     with _content(model / f"images.{kind}") as content:
         for number, pose, camera, file in _images(content, kind == "txt"):
             where = f"{model / f'images.{kind}'}, image {number}"
@@ -88,6 +86,9 @@ def read_images(model: Path) -> dict[int, ColmapImage]:
             if number in images or numbers.setdefault(file, number) != number:
                 raise DataError(f"{where}: its number or its name {file!r:.80} is listed twice; remove one of the two")
             images[number] = ColmapImage(file, pose, camera, cameras[camera])
+    other = read_images(model, ["bin"]) if len(present) > 1 else images
+    if other.keys() != images.keys() or any(math.dist(other[n].pose, images[n].pose) > 0.01 for n in images):
+        raise DataError(f"{model} holds a text and a binary model that differ; remove the outdated one")
     if not images:
         raise DataError(f"{model} has no images; the reconstruction failed, run it again")
     return images

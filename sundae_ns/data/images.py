@@ -23,13 +23,12 @@ from sundae_ns.data.capture import beside
 HEIF = (".heic", ".heif", ".hif")  # for which Pillow needs the package pillow-heif
 TURNED = (5, 6, 7, 8)  # EXIF orientations that swap width and height
 JPEG: dict[str, Any] = {"quality": 97, "subsampling": 0}
-REPAIR = "repair it or remove the view"
+REPAIR = "repair it, save it as JPEG or PNG of 8 bits, or remove it"
 _TURN = "orientation of a TIFF"
 # Pillow's types of pixels that are read, and those in which their colours are converted.
 _MODES = {"CMYK": "CMYK", **dict.fromkeys(("1", "L", "LA", "I;16", "I;16B", "I;16L"), "L")}
 _MODES |= dict.fromkeys(("P", "PA", "RGB", "RGBA", "YCbCr"), "RGB")
-PQ, HLG = 16, 18  # transfers
-HIGH_RANGE = (PQ, HLG)
+HIGH_RANGE = PQ, HLG = 16, 18  # transfers
 # Chromaticities of red, green and blue, of BT.709 and sRGB, of BT.2020 and of Display P3; white is D65.
 _SRGB = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06)
 _PRIMARIES = {9: (0.708, 0.292, 0.170, 0.797, 0.131, 0.046), 12: (0.680, 0.320, 0.265, 0.690, 0.150, 0.060)}
@@ -216,7 +215,7 @@ _LIGHT: dict[float, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
 def exif_orientation(path: Path) -> int:
     """EXIF orientation of an image, from 1 (as stored) to 8; 1 if it states none."""
     with suppress(Exception), opened(path) as image:  # decoders raise many kinds; a damaged entry is none
-        return orientation_in(image)
+        return orientation_in(image) if image.format != "PNG" or "exif" in image.info else 1  # which decodes the pixels
     return 1
 
 

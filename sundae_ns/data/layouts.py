@@ -89,13 +89,14 @@ def _blender_layout(data: Path) -> Layout:
         if not (path := data / f"transforms_{split}.json").exists():
             raise DataError(f"{path} does not exist{beside(path)}, which Blender's layout needs; copy another split's")
         frames = read_json(path).get("frames")
+        if b"\\\\" in path.read_bytes():
+            raise DataError(f"{path} has paths of Windows, which nerfstudio does not find here; write / in place of \\")
         named = isinstance(frames, list) and all(isinstance(frame, dict) and "file_path" in frame for frame in frames)
         if not frames or not named:
             raise DataError(f"{path} lists no frames with a file_path; export it again")
         lists.append(frames)
     check_image(data / f"{lists[0][0]['file_path']}.png")
-    # nerfstudio puts transparent images over white.
-    description = f"Blender layout: {len(lists[0]):,} training images, over white"
+    description = f"Blender layout: {len(lists[0]):,} training images, over white"  # as nerfstudio puts them
     return Layout(description, ["blender-data"], ("--pipeline.model.background-color", "white"))
 
 

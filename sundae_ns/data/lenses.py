@@ -34,12 +34,11 @@ COLMAP_LENSES: dict[str, tuple[int, str | None, str, str]] = {
 """COLMAP's camera models: number, kind (None if there is none), parameters in their order, and those that must be 0."""
 _KINDS = {name: kind for name, (_, kind, _, z) in COLMAP_LENSES.items() if kind and not z} | {FISHEYE624: FISHEYE624}
 REMEDY = "make undistorted images with `colmap image_undistorter`, or calibrate the capture with OPENCV"
-_ONE_EYE = "render or cut perspective images (cube faces) of one eye, each with its own pose"
 _REMEDIES = {
     "EQUIRECTANGULAR": "the images are panoramas: cut them into perspective images with `ns-process-data images "
     "--camera-type equirectangular --data PANORAMAS --output-dir CAPTURE`, which finds new poses",
-    "OMNIDIRECTIONALSTEREO": f"the images are stereo panoramas: {_ONE_EYE}",
-    "VR180": f"the images are half panoramas of stereo: {_ONE_EYE}",
+    "CYLINDRICAL": "the image is a panorama: leave it out, or take photos from several places",
+    **dict.fromkeys(("OMNIDIRECTIONALSTEREO", "VR180"), "the images show two eyes: cut cube faces of one, with poses"),
     "ORTHOPHOTO": "an orthophoto has no focal length: train on the photos that it was made of",
 }
 """Projections that no perspective image shows whole, by the start of their names, and the remedy."""

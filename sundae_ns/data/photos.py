@@ -17,7 +17,7 @@ from PIL import ExifTags, Image
 
 from sundae_ns.core.errors import DataError, reading, regular
 from sundae_ns.data import images
-from sundae_ns.data.images import HEIF, TURNED, check_image, opened, orientation_in, reads_heif
+from sundae_ns.data.images import HEIF, REPAIR, TURNED, check_image, opened, orientation_in, reads_heif
 from sundae_ns.data.layouts import LONGEST_SIDE
 from sundae_ns.data.lenses import kind_of_model
 
@@ -29,7 +29,6 @@ LEAST_PHOTOS = 3  # with a pose that a scene needs, because nerfstudio holds out
 _COPIED = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}
 _CONVERTED = ("TIFF", "WEBP", "BMP", "HEIF")
 _MASKS = ("masks", "mask")  # names of folders whose images are masks
-_REPAIR = "repair or remove it"
 
 
 class Photo(NamedTuple):
@@ -108,9 +107,9 @@ def masks_beside(folder: Path) -> Path | None:
 
 def upright(photo: Photo) -> tuple[Image.Image, Image.Exif]:
     """The upright pixels of a photo in sRGB, and its EXIF data; ``DataError`` if they are broken."""
-    with reading(photo.path, "a photo that can be decoded", remedy=_REPAIR, missing=_REPAIR):
+    with reading(photo.path, "a photo that can be decoded", remedy=REPAIR, missing=REPAIR):
         if photo.path.suffix.lower() == RAW:
-            with _raw(photo.path) as raw:
+            with importlib.import_module("rawpy").imread(str(regular(photo.path))) as raw:  # comes with nerfstudio
                 return Image.fromarray(raw.postprocess()), Image.Exif()
         with opened(photo.path) as image:
             image.load()
@@ -120,10 +119,6 @@ def upright(photo: Photo) -> tuple[Image.Image, Image.Exif]:
         for name in (ExifTags.IFD.Interop, ExifTags.Base.ColorSpace):  # which may say Adobe RGB
             exif.get_ifd(ExifTags.IFD.Exif).pop(name, None)
     return pixels, exif
-
-
-def _raw(path: Path) -> Any:
-    return importlib.import_module("rawpy").imread(str(regular(path)))  # comes with nerfstudio
 
 
 def _files(folder: Path) -> Iterator[Path]:
@@ -137,16 +132,17 @@ def _files(folder: Path) -> Iterator[Path]:
 
 def photo_of(path: Path) -> Photo:
     """A photo, after a check of its header; ``DataError`` if the file is none, or of a format that is not read."""
-    with reading(path, "a photo", remedy=_REPAIR, missing=_REPAIR):
+    with reading(path, "a photo", remedy=REPAIR, missing=REPAIR):
         if path.suffix.lower() == RAW:
-            with _raw(path) as raw:
+            with importlib.import_module("rawpy").imread(str(regular(path))) as raw:
                 size = raw.sizes.iwidth, raw.sizes.iheight
                 return Photo(path, ".jpg", size[::-1] if raw.sizes.flip in (5, 6) else size, False, (RAW,))
         size = check_image(path)
         with opened(path) as image:
             kind, alpha, exif = str(image.format), image.has_transparency_data, image.getexif()
             orientation, lens, srgb = orientation_in(image), _lens(exif), images.is_srgb(image)
-            kind_of_model("EQUIRECTANGULAR" if "equirectangular" in str(image.info.get("xmp")) else "OPENCV", str(path))
+            told = f"{image.info.get('xmp')} {lens}".upper()
+            kind_of_model(next((one for one in ("EQUIRECTANGULAR", "CYLINDRICAL") if one in told), "OPENCV"), str(path))
     if kind not in (*_COPIED, *_CONVERTED):
         raise DataError(f"{path} is a {kind} file by its contents; save it as JPEG or PNG, or remove it")
     check_shape(path, size)
@@ -162,10 +158,10 @@ def check_shape(path: Path, size: tuple[int, int]) -> None:
 
 
 def _lens(exif: Image.Exif) -> tuple[str, ...]:
-    """Maker, model, lens and focal length of a photo, if they are stated."""
+    """Maker, model, lens and focal length of a photo, if they are stated, and whether it is an iPhone's panorama."""
     with suppress(Exception):  # a damaged entry is none
         inner, base = exif.get_ifd(ExifTags.IFD.Exif), ExifTags.Base
-        focal = f"{float(inner.get(base.FocalLength, 0)):.1f}"
+        focal = f"{float(inner.get(base.FocalLength, 0)):.1f}" + " cylindrical" * (inner.get(base.CustomRendered) == 6)
         return str(exif.get(base.Make)), str(exif.get(base.Model)), str(inner.get(base.LensModel)), focal
     return ()
 
@@ -176,15 +172,15 @@ def masks_of(photos: Sequence[Photo], folder: Path) -> list[Path]:
     for path, _, wanted, _, _ in photos:
         names = (path.name, f"{path.name}.png", f"{path.stem}.png", f"{path.stem}.jpg")
         places = folder / path.parent.relative_to(root), path.parent / folder.name, folder
-        tried = [place / name for place in places for name in names]
-        if (mask := next((each for each in tried if each.is_file()), None)) is None:
+        if (mask := next((place / n for place in places for n in names if (place / n).is_file()), None)) is None:
             raise DataError(f"{path} has no mask {path.stem}.png in {folder}; add it, white where pixels count")
         if mask in masks:
             raise DataError(f"{path} and another photo have one mask, {mask}; put masks into folders as the photos are")
         size, orientation = check_image(mask, mask=True), images.exif_orientation(path)
         # A mask of the upright size is upright; where both sizes are the same, nothing says so.
-        if orientation != 1 and not (orientation in TURNED and size == wanted != size[::-1]):
-            raise DataError(f"{path} is turned by its EXIF entry, and its mask is not; save both upright")
+        known = orientation == 1 or (orientation in TURNED and size == wanted != size[::-1])
+        if not known or images.exif_orientation(mask) != 1:
+            raise DataError(f"{path} or its mask is turned by its EXIF entry, and the other is not; save both upright")
         if size != wanted:
             raise DataError(f"{mask} has {size[0]} x {size[1]} px and its photo {wanted[0]} x {wanted[1]}; scale it")
         masks.append(mask)

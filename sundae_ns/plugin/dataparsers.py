@@ -136,8 +136,7 @@ def _float32_step(centres: Array) -> float:
     """Step between float32 numbers at the coordinates of camera centres ``[N, 3]``, as a share of their distances."""
     middle, distances = _distances_of(centres)
     usual = float(np.median(distances)) or float(distances.max())
-    step = float(np.spacing(np.float32(np.abs(middle).max())))
-    return step / usual if usual > 0 else 0.0
+    return float(np.spacing(np.float32(np.abs(middle).max()))) / usual if usual > 0 else 0.0
 
 
 class _SurveyOutputs(DataparserOutputs):
@@ -242,8 +241,7 @@ class LightNerfstudioParser(_PosedParser, Nerfstudio):
         for entries in (meta, *frames):
             for key in (*DISTORTION, "distortion_params"):
                 entries.pop(key, None)
-        for key in INTRINSICS:
-            meta.pop(key, None)
+        meta = {key: value for key, value in meta.items() if key not in INTRINSICS}
         kinds = {lens.kind for lens in self.lenses.values()}
         meta["camera_model"] = kinds.pop() if len(kinds) == 1 else PERSPECTIVE
 
@@ -364,12 +362,15 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
     if (mirrored := torch.linalg.det(cameras.camera_to_worlds[:, :, :3]) < 0).any():
         which = f"{next(compress(names, mirrored)).name} mirrors an axis ({mirrored.sum()} of {len(names)} do)"
         raise DataError(f"the pose of {which}; negate one column of its rotation")
-    ratios = (cameras.fx / cameras.width.clamp_min(1)).flatten()
-    strange = (ratios < 0.01) | (ratios > 1000)  # views of 178 and of 0.06 degrees
+    sizes = torch.cat([cameras.width, cameras.height], dim=1).clamp_min(1)
+    centre, focal = torch.cat([cameras.cx, cameras.cy], dim=1), cameras.fx[:, 0] / sizes[:, 0]
+    # Views of 178 and of 0.06 degrees; principal points far outside, or as shares of the image.
+    far = (centre / sizes - 0.5).abs().amax(dim=1) > 1.5
+    strange = (focal < 0.01) | (focal > 1000) | far | ((centre.amax(dim=1) <= 1) & (sizes.amin(dim=1) > 8))
     if strange.any():
-        size = f"{float(cameras.fx[strange][0]):.3g} px and the image is {int(cameras.width[strange][0])} px wide"
-        which = next(compress(names, strange)).name
-        raise DataError(f"the focal length of {which} is {size}, which no lens has; give it in pixels")
+        w, fl_x, cx, cy = torch.cat([sizes[:, :1], cameras.fx, centre], dim=1)[strange][0].tolist()
+        values = f"fl_x {fl_x:.3g}, cx {cx:.3g}, cy {cy:.3g} at a width of {w:.0f} px"
+        raise DataError(f"{next(compress(names, strange)).name} has {values}, which no lens has; give all in pixels")
     if points is not None:
         warn_of_cloud(points, cameras)
     centres = cameras.camera_to_worlds[:, :, 3]
@@ -421,8 +422,7 @@ def warn_of_cloud(points: Tensor, cameras: Cameras) -> None:
     """
     points = points[torch.isfinite(points).all(dim=1)].cpu()
     points = points[torch.linspace(0, max(len(points) - 1, 0), min(2000, len(points))).long()]
-    empty = 0
-    parts = (cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.width, cameras.height)
+    empty, parts = 0, (cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.width, cameras.height)
     lenses = torch.cat([part.float() for part in parts], dim=-1).cpu()
     for pose, (fx, fy, cx, cy, width, height) in zip(cameras.camera_to_worlds.cpu(), lenses.tolist(), strict=True):
         x, y, z = ((points - pose[:, 3]) @ pose[:, :3]).unbind(dim=1)

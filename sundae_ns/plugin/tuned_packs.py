@@ -89,8 +89,7 @@ def finetune(
                 model.step = at  # chooses the crop of a large image
             camera, batch = pipeline.datamanager.next_train(at)
             settings = replace(model.render_settings(training=True), drop_rate=0.0)
-            result = training.step(model.step_inputs(camera, batch), settings)
-            progress(result.loss)
+            progress(training.step(model.step_inputs(camera, batch), settings).loss)
     exact = {name: value.detach().cpu() for name, value in training.exact.items()}
     trained = replace(
         scene,

@@ -75,6 +75,7 @@ def test_a_capture_of_blender(tmp_path):
     for number, frames in enumerate(([], 3, [{}], ["r_0"])):
         other = blender(tmp_path / str(number), frames=frames)
         refused(posed_layout, other, r"transforms_train\.json lists no frames with a file_path")
+    refused(posed_layout, blender(tmp_path / "windows", name="a\\b"), "has paths of Windows, .*; write /")
 
 
 def test_what_cannot_be_read_is_named(tmp_path):
@@ -132,6 +133,7 @@ def test_a_larger_model_is_named(tmp_path):
         ("cameras.bin", ["Cameras.bin"], "Cameras.bin"),
         ("x.png", ["x.png.png"], "x.png.png"),
         ("x.jpg", ["x.JPG", "y.jpg"], "x.JPG"),
+        ("\xe9.jpg", ["e\u0301.jpg"], r"'e\u0301.jpg'"),
         ("IMG_0001.JPG", ["img_0001.jpeg"], "img_0001.jpeg"),
         ("frame_00001.png", ["frame_00002.png"], None),
         ("x.png", ["x.png", "X.png"], None),

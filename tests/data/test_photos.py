@@ -67,6 +67,7 @@ def zipped_text(path):
 
 
 SPHERE = b'<rdf:Description GPano:ProjectionType="equirectangular"/>'
+CYLINDER = SPHERE.replace(b"equirectangular", b"cylindrical")
 ODD = {
     "a pipe": (os.mkfifo, "it is a pipe or a device"),
     "a raw pipe": (lambda path: os.mkfifo(path.with_suffix(".cr2")), "it is a pipe or a device"),
@@ -79,10 +80,9 @@ ODD = {
     "another format": (lambda path: photo(path, "ppm"), "is a PPM file by its contents"),
     "floats": (lambda path: photo(path, "tiff", "F"), "pixels of type F"),
     "a bomb of text": (zipped_text, "Decompressed data too large"),
-    "a panorama": (
-        lambda path: Image.new("RGB", (32, 16)).save(path, "WEBP", xmp=SPHERE),
-        "the images are panoramas: cut",
-    ),
+    "a panorama": (lambda path: Image.new("RGB", (32, 16)).save(path, "WEBP", xmp=SPHERE), "are panoramas: cut"),
+    "a cylinder": (lambda path: Image.new("RGB", (32, 16)).save(path, "WEBP", xmp=CYLINDER), "a panorama: leave it"),
+    "a panorama of an iPhone": (lambda path: photo(path, panorama=True), "a panorama: leave it"),
     "a line": (lambda path: photo(path, size=(8000, 2)), "8000 x 2 px, too narrow for camera poses"),
     "a column": (lambda path: photo(path, size=(20, 8000)), "20 x 8000 px, too narrow for camera poses"),
 }
@@ -157,6 +157,9 @@ def test_the_mask_of_a_photo_has_its_upright_size(tmp_path, name, orientation, s
     path = photo(tmp_path / "photos" / "a.jpg", "jpeg", orientation=orientation)
     mask = photo(tmp_path / "masks" / name, mode="L", size=size)
     assert masks_of([photo_of(path)], mask.parent) == [mask]
+    photo(mask, mode="L", size=size, orientation=3)
+    with pytest.raises(DataError, match="or its mask is turned by its EXIF entry"):
+        masks_of([photo_of(path)], mask.parent)
 
 
 def test_masks_lie_in_folders_as_their_photos_do(tmp_path):

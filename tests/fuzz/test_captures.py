@@ -142,6 +142,8 @@ REFUSED = {
 def test_valid_models_are_read(capture):
     assert verdict(lambda: load(capture, colmap=True), bytes_of(capture)) is None
     binary = load(capture, colmap=True)
+    write_text_model(capture / "sparse/0", sorted(path.name for path in (capture / "images").iterdir()))
+    load(capture, colmap=True)
     as_text(capture)
     text = load(capture, colmap=True)
     assert torch.equal(binary.train_dataset.cameras.camera_to_worlds, text.train_dataset.cameras.camera_to_worlds)
@@ -223,6 +225,7 @@ MODELS = {
     "a camera twice": (_twice, "camera 1: it is listed twice"),
     "a number twice": (lambda model: _text(model, f"{ROW} a.png\n\n{ROW} b.png"), "image 1: .* is listed twice"),
     "a name twice": (lambda model: _text(model, f"{ROW} a.png\n\n2{ROW[1:]} a.png"), "image 2: .*'a.png' is .* twice"),
+    "another text": (lambda model: write_text_model(model, ["a.png"]), "a text and a binary model that differ; remove"),
     "a folder in the place of a file": (_folder("cameras.bin"), "cannot be read"),
     "a folder in the place of a text": (_folder("cameras.txt"), "cannot be read"),
     "invalid UTF-8": (lambda model: (model / "cameras.txt").write_bytes(b"1 PIN\xff\xfe"), "cameras.txt .*utf-8"),

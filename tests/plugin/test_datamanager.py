@@ -149,12 +149,12 @@ def test_point_cloud_needs_no_open3d(still_life, load, monkeypatch):
     assert outputs.metadata["points3D_rgb"].dtype == torch.uint8
 
 
-def cameras(*, focal=20.0, mirrored=False, spread=1.0, outlier=0.0, kind=CameraType.PERSPECTIVE):
+def cameras(*, focal=20.0, cx=10.0, cy=8.0, mirrored=False, spread=1.0, outlier=0.0, kind=CameraType.PERSPECTIVE):
     poses = torch.eye(4)[None, :3].repeat(6, 1, 1)
     poses[:, :, 3] = spread * torch.randn(6, 3, generator=torch.Generator().manual_seed(0))
     poses[4, 0, 0] = -1.0 if mirrored else 1.0
     poses[4, 0, 3] += outlier
-    return Cameras(poses, fx=focal, fy=focal, cx=10.0, cy=8.0, width=20, height=16, camera_type=kind)
+    return Cameras(poses, fx=focal, fy=focal, cx=cx, cy=cy, width=20, height=16, camera_type=kind)
 
 
 NAMES = [Path(f"{index}.png") for index in range(6)]
@@ -165,8 +165,10 @@ NAMES = [Path(f"{index}.png") for index in range(6)]
     [
         ({"kind": CameraType.VR180_L}, r"camera of 0\.png is of type VR180_L; .*such as cube faces"),
         ({"mirrored": True}, r"pose of 4\.png mirrors an axis \(1 of 6"),
-        ({"focal": 1e-5}, r"focal length of 0\.png is 1e-05 px and the image is 20 px wide"),
-        ({"focal": 1e9}, r"no lens has; give it in pixels"),
+        ({"focal": 1e-5}, r"0\.png has fl_x 1e-05, cx 10, cy 8 at a width of 20 px"),
+        ({"focal": 1e9}, r"no lens has; give all in pixels"),
+        ({"cx": 50.5}, r"has fl_x 20, cx 50\.5, cy 8 at"),
+        ({"cx": 0.5, "cy": 0.4}, r"cx 0\.5, cy 0\.4 at"),
     ],
 )
 def test_cameras_that_cannot_be(options, cause):
@@ -250,7 +252,7 @@ def test_a_question_without_a_terminal(still_life, monkeypatch):
     [
         ({"train_filenames": []}, {}, "has no training images, and training needs 2 or more; check the path and"),
         ({"train_filenames": ["images/frame_00001.png"]}, {}, "has 1 training image, and training needs 2"),
-        ({"fl_x": 1e-5, "fl_y": 1e-5}, {}, "focal length of frame_"),
+        ({"fl_x": 1e-5, "fl_y": 1e-5}, {}, "frame_.* has fl_x 1e-05"),
         ({}, {"manager": {"train_cameras_sampling_strategy": "fps"}}, "fps is not a function of seed and step"),
         ({}, {"manager": {"camera_res_scale_factor": math.nan}}, "--camera-res-scale-factor is nan; give a positive"),
         ({}, {"manager": {"camera_res_scale_factor": 0.01}}, "has no pixel at the given scale of images"),

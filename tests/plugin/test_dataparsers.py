@@ -10,6 +10,7 @@ import pytest
 import torch
 from colmap_models import write_model
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from photos import photo
 from PIL import Image, ImageOps
 from plyfile import PlyData, PlyElement
 from small_captures import meta_of, names_of
@@ -410,3 +411,6 @@ def test_masks_of_turned_photos(capture, load, edit):
     assert batch["mask"].shape[:2] == batch["image"].shape[:2] == (24, 16)
     assert not batch["mask"][:4].any()
     assert batch["mask"][4:].all()
+    photo(capture / "mask.png", image=mask, orientation=3)
+    with pytest.raises(DataError, match=r"mask\.png is turned by its EXIF entry, and its image is not"):
+        load(capture).next_train(0)

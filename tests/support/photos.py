@@ -19,6 +19,7 @@ def photo(
     orientation: int = 1,
     model: str = "",
     focal: float | None = None,
+    panorama: bool = False,
 ) -> Path:
     """Write a photo with entries of EXIF, of the kind of its suffix by default; its folder is made."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -26,6 +27,8 @@ def photo(
     exif.update({ORIENTATION: orientation} | ({MODEL: model} if model else {}))
     if focal is not None:
         exif.get_ifd(EXIF)[FOCAL] = focal
+    if panorama:
+        exif.get_ifd(EXIF)[0xA401] = 6  # of Apple
     colour = (31 * sum(path.name.encode()) % 256, 128, 128) if mode == "RGB" else 0
     (image or Image.new(mode, size, colour)).save(path, format=kind, exif=exif.tobytes())
     return path

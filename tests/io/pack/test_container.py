@@ -113,21 +113,9 @@ def test_headers_are_json_of_utf8_with_numbers_of_float64():
     deepest = LIMITS["depth"]
     assert parsed(b"[" * deepest + b"]" * deepest)
     assert parsed(b"1" + b"0" * 300)
-    for text in (
-        b"[" * (deepest + 1) + b"]" * (deepest + 1),
-        b"[" * 100_000,
-        b"\xef\xbb\xbf{}",
-        "{}".encode("utf-16"),
-        b'"\xff"',
-        b'"\xed\xa0\x80"',  # a surrogate
-        b"NaN",
-        b"1e999",
-        b"-1e999",
-        b"1" + b"0" * 400,
-        b"1" + b"0" * 5000,
-        b"01",
-        b"{} {}",
-    ):
+    wrong = [b"[" * (deepest + 1) + b"]" * (deepest + 1), b"[" * 100_000, b"1" + b"0" * 400, b"1" + b"0" * 5000]
+    wrong += [b"NaN", b"1e999", b"-1e999", b"01", b"{} {}", "{}".encode("utf-16"), b"\xef\xbb\xbf{}", b'"\xff"']
+    for text in (*wrong, b'"\xed\xa0\x80"'):  # a surrogate
         with pytest.raises((ValueError, RecursionError), match=r"\w"):
             parsed(text)
 
