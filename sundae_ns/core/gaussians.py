@@ -152,10 +152,10 @@ def checked(params: Mapping[str, Any]) -> Gaussians:
         raise DataError(faults[0])
     if not num_gaussians(values):
         raise DataError("there are no Gaussians; give at least one")
-    if len(devices := {str(value.device) for value in values.values()}) > 1:
-        raise DataError(f"the Gaussians are on {' and '.join(sorted(devices))}; move them to one device")
+    if len(devices := {str(value.device) for value in values.values()}) > 1 or "meta" in devices:
+        raise DataError(f"the Gaussians are on {' and '.join(sorted(devices))}; move them to one that holds values")
     limits = [limit for value in values.values() if value.numel() for limit in value.detach().aminmax()]
-    if not values["means"].is_meta and not bool(torch.stack(limits).isfinite().all()):
+    if not bool(torch.stack(limits).isfinite().all()):
         if wrong := sanitise(values).dropped:
             raise DataError(f"{wrong:,} of {num_gaussians(values):,} Gaussians are NaN or infinite; remove these rows")
     return gaussians if all(values[name] is value for name, value in gaussians.items()) else gaussians.replaced(values)

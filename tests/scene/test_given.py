@@ -120,6 +120,7 @@ REFUSED = {
     "NaN": (lambda: scene(means=torch.tensor([[torch.nan] * 3, *8 * [[0.0] * 3]])), "1 of 9 Gaussians are NaN"),
     "infinite": (lambda: scene(scales=torch.full((9, 3), torch.inf)), "9 of 9 Gaussians"),
     "devices": (lambda: scene(means=torch.zeros(9, 3, device="meta")), "are on cpu and meta"),
+    "no values": (lambda: SCENE.to("meta"), "are on meta; move them to one that holds values"),
     "nothing": (lambda: sn.Scene({n: v[:0] for n, v in random_field(9).items()}), "no Gaussians"),
     "head": (lambda: dataclasses.replace(SCENE, head=CompensationHead(HeadConfig(size="tiny"))), "the head reads"),
     "background": (lambda: dataclasses.replace(SCENE, background_color="grey"), "the background is 'grey'"),
