@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# A lease of a GPU machine that starts bare: lease.sh setup | add PLAN | wait SECONDS. Each call carries .gpu/pN as well.
+# A lease of a GPU machine that starts bare: lease.sh setup | add PLAN | look | wait SECONDS. Each call carries .gpu/pN as well.
 #   setup  carry .gpu/wheels .gpu/setup.sh .gpu/gsplat-1.4.0-*.so.xz (made by ../shared/gpu/pack.sh and lab/wheels.sh)
 #   add    puts the captures of .gpu/p*/scenes in place and queues PLAN: lines "NAME | GPU or - | COMMAND", lowest name first
 #   wait   waits for the queue, or so many seconds, and packs /tmp/out and the logs into $OUT
@@ -16,6 +16,7 @@ case $1 in
     bash .gpu/setup.sh > /tmp/setup.log 2>&1; tail -n 1 /tmp/setup.log; python3 lab/console_scripts.py
     mkdir -p $R $J /tmp/logs /tmp/out; cp -r benchmarks lab tests docs examples web *.md pyproject.toml Makefile mkdocs.yml method_configs $R/
     cp lab/slots.py /tmp/; (cd benchmarks; python3 -c 'import harness.job, sundae_ns.method_configs') || exit 3
+    touch /tmp/logs/queue.log
     cd /tmp; setsid nohup python3 slots.py > logs/q.out 2>&1 & ;;
   add)
     [ -f /tmp/logs/queue.log ] || { echo "no setup on this machine: give it back"; exit 3; }
@@ -25,8 +26,10 @@ case $1 in
       { [ "$gpu" = - ] || echo "# gpu $gpu"; echo "cd /tmp; $command"; } > $J/$name.new && mv $J/$name.new $J/$name.sh
     done < $H/$2
     ls $J | wc -l ;;
+  look)
+    tail -n 12 /tmp/logs/queue.log; bash lab/look.sh; tar -czf $OUT/out.tgz --exclude="*.ckpt" --exclude="events.*" --exclude="*.sundae" --exclude="*.jpg" -C /tmp out logs ;;
   wait)
     touch $J/END; SECONDS=0
     until grep -q "all done" /tmp/logs/queue.log || [ $SECONDS -gt $2 ]; do sleep 1; done
-    tar -czf $OUT/out.tgz --exclude='*.ckpt' --exclude='events.*' --exclude='*.sundae' -C /tmp out logs; awk '/done/' /tmp/logs/queue.log | tail -n 40; grep -l Traceback /tmp/logs/*.log ;;
+    tar -czf $OUT/out.tgz --exclude='*.ckpt' --exclude='events.*' --exclude='*.sundae' --exclude='*.jpg' -C /tmp out logs; awk '/done/' /tmp/logs/queue.log | tail -n 40; grep -l Traceback /tmp/logs/*.log ;;
 esac
