@@ -120,7 +120,7 @@ class Camera(NamedTuple):
         center, point, above = numbers(eye, "eye", (3,)), numbers(target, "target", (3,)), numbers(up, "up", (3,))
         if min(float((center - point).norm()), float(above.norm())) < 1e-12:
             raise ConfigError("eye and target are one point, or up is zero, so there is no direction; give others")
-        return cls.from_fov(poses_looking_at(center, point, above), fov, width, height)
+        return cls.from_fov(poses_looking_at(center, point, above / above.norm()), fov, width, height)
 
     @property
     def center(self) -> Tensor:
@@ -157,7 +157,7 @@ class Camera(NamedTuple):
 
 
 def poses_looking_at(eyes: Tensor, targets: Tensor, up: Tensor) -> Tensor:
-    """Camera-to-world with OpenGL axes ``[..., 3, 4]`` of cameras at ``eyes`` that look at ``targets`` ``[..., 3]``."""
+    """Camera-to-world, OpenGL axes ``[..., 3, 4]``, of cameras at eyes that look at targets ``[..., 3]``; unit up."""
     back = torch.nn.functional.normalize(eyes - targets, dim=-1)
     right = torch.linalg.cross(up.expand_as(back), back)
     other = torch.linalg.cross(torch.nn.functional.one_hot(back.abs().argmin(dim=-1), 3).to(back), back)

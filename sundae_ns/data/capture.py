@@ -147,7 +147,7 @@ _CHECKS: dict[str, Callable[[Any, str, str], Any]] = {
     "camera_model": lambda value, _, where: kind_of_model(value, where),
     "transform_matrix": lambda value, name, where: rigid(matrix(value, (4,), name, where), where),
     "applied_transform": lambda value, name, where: matrix(value, (3,), name, where),
-    "orientation_override": _must({"pca", "up", "vertical", "none"}.__contains__, "pca, up, vertical or none"),
+    "orientation_override": _must(("pca", "up", "vertical", "none").__contains__, "pca, up, vertical or none"),
 }
 
 

@@ -203,8 +203,8 @@ class _Ply:
 
     def __init__(self, path: Path) -> None:
         self.path, self.text = path, False
+        # For each element the bytes (in text, the lines) before its rows, the number of these, and their dtype.
         self.elements: dict[str, tuple[int, int, np.dtype[Any]]] = {}
-        """For each, the bytes (in text, the lines) before its rows, their number, and their dtype."""
         with reading(path, "a complete .ply file"):
             self.header, order = _header(path), ""
             stated: dict[str, tuple[int, list[tuple[str, str]]]] = {}
@@ -252,10 +252,10 @@ class _Ply:
 
 
 def has_own_columns(path: Path) -> bool:
-    """Whether a .ply that :func:`read_ply` reads has unpacked values in bytes, so that rows can be copied."""
+    """Whether a .ply that :func:`read_ply` reads has all values as floats in binary, so that rows can be copied."""
     file = _Ply(path)
-    names = set(file.elements["vertex"][2].names or ())
-    return not file.text and all(names.issuperset(columns) for columns in _COLUMNS.values())
+    floats = {name for name, (kind, *_) in (file.elements["vertex"][2].fields or {}).items() if kind.kind == "f"}
+    return not file.text and all(floats.issuperset(columns) for columns in _COLUMNS.values())
 
 
 def ply_marks(path: Path) -> Marks:

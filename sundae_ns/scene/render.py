@@ -236,6 +236,6 @@ def contribution(
     views = each_view(of_view, cameras, pairs=total.is_cpu)
     for rows, new, image in track(views, label, len(cameras), transient=True, console=console, disable=not console):
         total[rows] += new
-        if images is not None:
+        if images is not None and count is not None:  # only a pass that weights by detail renders the image
             images.append(image)
     return total

@@ -133,7 +133,7 @@ REFUSED = {
     "a mask for one": ({"frames/1/mask_path": FIRST}, "1 of .* frames have a mask_path"),
     "a scale of zero": ({"applied_scale": 0}, "applied_scale"),
     "a frame of NaN": ({"applied_transform": [[NAN] * 4] * 3}, "applied_transform"),
-    "an unknown orientation": ({"orientation_override": "sideways"}, "orientation_override"),
+    "an unknown orientation": ({"orientation_override": ["up"]}, "orientation_override is"),
     "a cloud that is a number": ({"ply_file_path": 3}, "ply_file_path"),
     "a missing cloud": ({"ply_file_path": "none.ply"}, r"none\.ply does not exist"),
 }

@@ -11,7 +11,8 @@ from foreign_files import small_field, spz
 from limits import refused
 
 import sundae_ns as sn
-from sundae_ns.io.spz import read_spz
+from sundae_ns.io.ply import Marks
+from sundae_ns.io.spz import read_spz, write_spz
 
 
 @pytest.mark.parametrize(("version", "degree"), [(1, 3), (2, 0), (3, 4), (4, 1), (4, 0)])
@@ -32,8 +33,13 @@ def test_values_of_every_version(tmp_path, version, degree):
     assert ((found["quats"] * signs - truth["quats"])[:, 1:].abs() <= 1 / 127 + 1e-6).all()
 
 
-AXES = {"LDB": 1, "RUB": 4, "RDF": 6, "LUF": 7, "RUF": 8, "RBD": 10, "RFU": 16}
-"""Numbers of coordinate systems in Adobe's extension."""
+def test_the_longest_marks_fit_into_the_comment(tmp_path):
+    marks = Marks(True, True, (-2 / 3, 1 / 3, 2 / 3), (1e6 / 3, -1e5 / 7, -4e6 / 3))
+    write_spz(tmp_path / "a.spz", small_field(9), marks)
+    assert read_spz(tmp_path / "a.spz")[1] == marks
+
+
+AXES = {"LDB": 1, "RUB": 4, "RDF": 6, "LUF": 7, "RUF": 8, "RBD": 10, "RFU": 16}  # numbers in Adobe's extension
 
 
 @pytest.mark.parametrize("axes", AXES)
@@ -53,13 +59,9 @@ def test_stated_axes_are_turned_to_those_of_a_ply(tmp_path, version, axes):
     assert_moved(found, plain, turn)
 
 
-def _bomb(size):
-    return zstandard.ZstdCompressor(level=1).compress(bytes(size))
-
-
-def _with_stream(content, frame):
-    """The positions are another frame, which the table states as the right one."""
-    stored = struct.unpack_from("<Q", content, 32)[0]
+def _with_stream(content, size):
+    """The positions are a frame of another size, which the table states as the right one."""
+    frame, stored = zstandard.compress(bytes(size), 1), struct.unpack_from("<Q", content, 32)[0]
     return content[:32] + struct.pack("<Q", len(frame)) + content[40:128] + frame + content[128 + stored :]
 
 
@@ -67,8 +69,8 @@ FIELD = small_field(100, 1)
 HOSTILE = {
     "a second member": (lambda: spz(FIELD, 3) + gzip.compress(bytes(1 << 27), 1), "unpacks to more"),
     "a long end": (lambda: gzip.compress(gzip.decompress(spz(FIELD, 3)) + bytes(1 << 27), 1), "unpacks to more"),
-    "a frame of 256 MB": (lambda: _with_stream(spz(FIELD, 4), _bomb(1 << 28)), "has not the 900 bytes"),
-    "a short frame": (lambda: _with_stream(spz(FIELD, 4), _bomb(7)), "has not the 900 bytes"),
+    "a frame of 256 MB": (lambda: _with_stream(spz(FIELD, 4), 1 << 28), "has not the 900 bytes"),
+    "a short frame": (lambda: _with_stream(spz(FIELD, 4), 7), "has not the 900 bytes"),
     "four billion Gaussians": (lambda: spz(FIELD, 4, count=2**32 - 1), "would unpack to"),
     "no Gaussians": (lambda: spz(FIELD, 3, count=0), "it states 0 Gaussians"),
     "fewer bytes than Gaussians": (lambda: spz(FIELD, 3, count=101), "bytes are missing"),

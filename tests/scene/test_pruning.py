@@ -83,7 +83,6 @@ def test_large_views_are_rendered_small(monkeypatch):
 
 
 def test_images_are_those_of_the_renderer():
-    """Also of views of several sizes."""
     full = scene()
     cameras = [*sn.virtual_cameras(full, 2, size=24), *sn.virtual_cameras(full, 1, size=12)]
     for camera, image in zip(cameras, module._blended(full.gaussians, cameras, full.settings()), strict=True):
