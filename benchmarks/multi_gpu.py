@@ -102,7 +102,7 @@ def measure(rank: int, ranks: int, folder: Path, options: argparse.Namespace, ex
     memory: list[Any] = [torch.cuda.max_memory_allocated() / 2**20 if cuda else 0.0] * ranks
     if ranks > 1:
         dist.all_gather_object(memory, memory[0])
-    with trainer.ranks.whole() as first:
+    with trainer.ranks.gathered() as first:
         if first:
             trainer.model.lpips = lambda *_: None  # would download its weights
             trainer.pipeline.eval()

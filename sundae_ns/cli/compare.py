@@ -78,10 +78,10 @@ def compare(
     measured_by = partial(measure, lpips=lpips, repeats=repeats, command=command)
     with progress_bar() as progress, TemporaryDirectory() as folder:
         if formats:
-            whole, suffix = load(scenes[0]) if first is None else first.to("cpu"), scenes[0].suffix.lower()
+            source, suffix = load(scenes[0]) if first is None else first.to("cpu"), scenes[0].suffix.lower()
             others = [Path(folder, scenes[0].stem + other) for other in (*FORMATS, ".sundae") if other != suffix]
             for path in progress.track(others, description="Writing all formats"):
-                save(whole, path)
+                save(source, path)
             scenes = [scenes[0], *others]
         opened = against_photos(data)
         if first is not None:

@@ -72,13 +72,13 @@ def export(
     if upright and not left.scene.in_model_frame:
         raise ConfigError(f"{scene} is not in nerfstudio's coordinates, which --upright turns; leave it out")
     if page:
-        shown = [before.shown()]
+        scenes = [before.for_page()]
         if beside is not None:
-            shown.append(opened(beside, Wishes(), SceneDetails(), capture=True).shown())
+            scenes.append(opened(beside, Wishes(), SceneDetails(), capture=True).for_page())
         named = {name: link for name, _, link in (word.partition("=") for word in views)}
-        size, file = write_page(out, *shown, views=named), out if suffix else out / "scene.sundae"
+        size, file = write_page(out, *scenes, views=named), out if suffix else out / "scene.sundae"
         print(f"{out}: {size:,} bytes; {'open it in a browser' if suffix else 'serve it'}")
-        costs = kind_of(scene) != "packed" or shown[0][1] is not before.scene
+        costs = kind_of(scene) != "packed" or scenes[0][1] is not before.scene
     elif lod:
         from sundae_ns.plugin.distill import levels_of  # imports nerfstudio, which takes seconds
 

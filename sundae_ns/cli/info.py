@@ -30,9 +30,9 @@ def info(scene: Scene, cameras: File = None, json: Flag = False) -> int:
     facts |= {"invisible": f"{facts['invisible']:.1%} of the Gaussians, to {facts.pop('seen_by')}"}
     facts |= {"crop": f"--crop {_words(facts['crop'])} holds 99% of what they see"}
     for name, value in facts.items():
-        parts = value if isinstance(value, dict) else {}
-        line = f"{name.replace('_', ' '):22}{'' if parts else _words(value)}".rstrip()
-        print(line, *(f"  {part:20}{size:,}" for part, size in parts.items()), sep="\n")
+        attributes = value if isinstance(value, dict) else {}
+        line = f"{name.replace('_', ' '):22}{'' if attributes else _words(value)}".rstrip()
+        print(line, *(f"  {attribute:20}{size:,}" for attribute, size in attributes.items()), sep="\n")
     return 0
 
 

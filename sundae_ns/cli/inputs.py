@@ -144,7 +144,7 @@ class Edit(NamedTuple):
                 pruned, form, file = prune_to_bytes(scene, most, file_of, forms, cameras, rule)
             return after(pruned, form)._replace(file=file)
 
-    def shown(self) -> Shown:
+    def for_page(self) -> Shown:
         """Name, scene and packed file of what a page shows; a packed scene stays as it is."""
         left, details, source = self.reduced(Path("page.html")), self.details, self.source.resolve()
         name = (source.parent if source.name == "scene.sundae" else source).stem  # sundae run names all packs so
@@ -163,15 +163,15 @@ class Edit(NamedTuple):
         """Print what a finished file costs, against the scene as it was opened; of a box, within it."""
         from sundae_ns.report.measure import cost_line
 
-        whole, name, crop = replace(self.scene, cameras=tuple(self.cameras)), "the whole scene", self.wishes.crop
+        reference, name, crop = replace(self.scene, cameras=tuple(self.cameras)), "the whole scene", self.wishes.crop
         if crop is not None:
-            whole, name = whole[crop_mask(whole, crop[:3], crop[3:])], "the scene in the box"
+            reference, name = reference[crop_mask(reference, crop[:3], crop[3:])], "the scene in the box"
         if upright:
-            whole = transform(whole, UPRIGHT[:, :3])
+            reference = transform(reference, UPRIGHT[:, :3])
         logging.disable()  # of what reading the file warns, writing it has
         try:
             with Console(stderr=True).status("Measuring what it costs"):
-                line = cost_line(file, self.source, whole.to(fastest_device()), name, seed=self.details.seed or 0)
+                line = cost_line(file, self.source, reference.to(fastest_device()), name, seed=self.details.seed or 0)
         except SundaeError as error:
             line = f"what this costs is not measured: {error}"
         finally:

@@ -111,8 +111,8 @@ def pack(
         before.print_cost(out)
         return 0
     (psnr, packed), (ssim, packed_ssim) = figures["psnr"], figures["ssim"]
-    shown = f"PSNR {psnr:.2f} -> {packed:.2f} dB, SSIM {ssim:.4f} -> {packed_ssim:.4f}, before and after"
-    print(f"{shown}, on {figures['views']} of {figures['test_views']} test views")
+    change = f"PSNR {psnr:.2f} -> {packed:.2f} dB, SSIM {ssim:.4f} -> {packed_ssim:.4f}, before and after"
+    print(f"{change}, on {figures['views']} of {figures['test_views']} test views")
     return 0
 
 

@@ -50,27 +50,27 @@ def render(
         raise ConfigError("--fps is of a video, from above 0 to 240; leave it out, or name a video .mp4")
     wishes.check_wishes()
     check_file(out, reads=[scene, camera, advanced.cameras], overwrite=advanced.overwrite)
-    shown = opened(scene, wishes, advanced).reduced(Path("scene.sundae")).stated
-    views, speed = list(shown.cameras), None
+    left = opened(scene, wishes, advanced).reduced(Path("scene.sundae")).stated
+    views, speed = list(left.cameras), None
     if camera is not None:
-        views, speed = read_cameras(camera, shown)
+        views, speed = read_cameras(camera, left)
     elif video:
         with Console(stderr=True).status("Finding a path"):
-            views = film_views(shown, seconds=12.0 if seconds is None else seconds, frames_per_second=fps or 24)
+            views = film_views(left, seconds=12.0 if seconds is None else seconds, frames_per_second=fps or 24)
     elif view is None or not views:
-        views = [start] if (start := opening(shown).start) is not None else views
+        views = [start] if (start := opening(left).start) is not None else views
     views = [each if width is None else each.zoomed(width / each.width) for each in views]
-    shown = shown.to(fastest_device())
+    left = left.to(fastest_device())
     if video:  # whose colours have half the size
         views = [each._replace(width=each.width // 2 * 2, height=each.height // 2 * 2) for each in views]
         speed = fps or speed or 24
         with replacing(out) as partial, progress_bar() as bar:
-            images = (image_of(render_view(shown, each).rgb) for each in bar.track(views, description="Rendering"))
+            images = (image_of(render_view(left, each).rgb) for each in bar.track(views, description="Rendering"))
             count = write_video(partial, images, frames_per_second=speed)
         print(f"{out}: {count} frames of {views[0].width} x {views[0].height} px, {count / speed:.1f} s")
         return 0
     if (view is None and len(views) > 1) or not 0 <= (index := view or 0) < len(views):
         raise ConfigError(f"there are {len(views)} cameras; give --view 0 to {len(views) - 1}, or write an .mp4")
-    write_image(out, image_of(render_view(shown, views[index]).rgb))
+    write_image(out, image_of(render_view(left, views[index]).rgb))
     print(f"{out}: {views[index].width} x {views[index].height} px")
     return 0

@@ -155,7 +155,7 @@ def has_gpu() -> bool:
 
 def _value_of(option: str, words: Sequence[str]) -> str | None:
     """The value of an option of ns-train, after a space or ``=``; None without it."""
-    split = [part for text in words for part in (text.split("=", 1) if text.startswith("--") else [text])]
+    split = [piece for text in words for piece in (text.split("=", 1) if text.startswith("--") else [text])]
     return next((value for name, value in pairwise(split) if name == option), None)
 
 

@@ -79,7 +79,7 @@ def view(
         no_open_browser: only print the address, and open no browser.
     """
     wishes.check_wishes()
-    page = page_of(opened(scene, wishes, advanced, capture=True).shown())
+    page = page_of(opened(scene, wishes, advanced, capture=True).for_page())
     with serve(page, port) as server, suppress(KeyboardInterrupt):
         address = f"http://127.0.0.1:{server.server_port}/"
         print(f"{scene} is shown at {address} until Ctrl-C", flush=True)

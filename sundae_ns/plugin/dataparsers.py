@@ -422,8 +422,8 @@ def warn_of_cloud(points: Tensor, cameras: Cameras) -> None:
     """
     points = points[torch.isfinite(points).all(dim=1)].cpu()
     points = points[torch.linspace(0, max(len(points) - 1, 0), min(2000, len(points))).long()]
-    empty, parts = 0, (cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.width, cameras.height)
-    lenses = torch.cat([part.float() for part in parts], dim=-1).cpu()
+    empty, values = 0, (cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.width, cameras.height)
+    lenses = torch.cat([value.float() for value in values], dim=-1).cpu()
     for pose, (fx, fy, cx, cy, width, height) in zip(cameras.camera_to_worlds.cpu(), lenses.tolist(), strict=True):
         x, y, z = ((points - pose[:, 3]) @ pose[:, :3]).unbind(dim=1)
         across, down = (x * fx / -z + cx) / width, (-y * fy / -z + cy) / height
@@ -453,8 +453,8 @@ def camera_of(camera: Cameras, device: torch.device | str, *, pose: Tensor | Non
     A ``pose``, camera-to-world with OpenGL axes ``[..., 3, 4]``, takes the place of the camera's own; differentiable.
     """
     # nerfstudio's methods of cameras build tensors and cameras at each call; here one copy from the device does.
-    parts = (camera.camera_to_worlds, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
-    *flat, fx, fy, cx, cy, width, height = torch.cat([part.detach().flatten() for part in parts]).tolist()
+    values = (camera.camera_to_worlds, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+    *flat, fx, fy, cx, cy, width, height = torch.cat([value.detach().flatten() for value in values]).tolist()
     dtype = camera.camera_to_worlds.dtype
     K = [fx / downscale, 0.0, cx / downscale, 0.0, fy / downscale, cy / downscale, 0.0, 0.0, 1.0]
     size = (int(width) // downscale, int(height) // downscale)

@@ -169,8 +169,8 @@ class BatchOptimizers(Optimizers):
             gradients = [value.grad for value in self.parameters[HEAD] if value.grad is not None]
             if gradients:
                 mean = _summed(torch.cat([gradient.flatten() for gradient in gradients])) / ranks
-                for gradient, part in zip(gradients, mean.split([gradient.numel() for gradient in gradients])):
-                    gradient.copy_(part.view_as(gradient))
+                for gradient, values in zip(gradients, mean.split([gradient.numel() for gradient in gradients])):
+                    gradient.copy_(values.view_as(gradient))
         groups = [group for name in param_groups if name != HEAD for group in self.optimizers[name].param_groups]
         before = [{"lr": group["lr"], "betas": group["betas"]} for group in groups]
         for group in groups:
@@ -185,7 +185,7 @@ class Ranks:
 
     def __init__(self, rank: int = 0, count: int = 1) -> None:
         self.rank, self.count = rank, count
-        self._whole = count == 1  # Whether the Gaussians are gathered now
+        self._is_gathered = count == 1  # Whether the Gaussians are gathered now
 
     def configured(self, config: Any) -> Any:
         """A copy of a trainer's configuration without the viewer, which could show one shard only."""
@@ -218,10 +218,10 @@ class Ranks:
 
     def after_step(self, callback: Callback, run: Any) -> None:
         """Let a callback act after a step, on the first rank alone if it needs all Gaussians. Collective."""
-        if self._whole or not callback.needs_all(run):
+        if self._is_gathered or not callback.needs_all(run):
             callback.after_step(run)
             return
-        with self.whole() as first:
+        with self.gathered() as first:
             if first:
                 callback.after_step(run)
         saved = _announced(callback.state_dict())
@@ -230,33 +230,33 @@ class Ranks:
             callback.after_step(run)  # it is done; the rest, such as learning rates, follows on all ranks
 
     @contextlib.contextmanager
-    def whole(self) -> Iterator[bool]:
+    def gathered(self) -> Iterator[bool]:
         """Gather the Gaussians on the first rank, and afterwards share what they have become. Collective.
 
         Yields:
             Whether this is the first rank, which acts; the others wait. An error of it ends the run.
         """
-        if self._whole:
+        if self._is_gathered:
             yield self.rank == 0
             return
         self._gather()
-        self._whole = True
+        self._is_gathered = True
         yield self.rank == 0
-        self._whole = False
+        self._is_gathered = False
         self._scatter()
 
     def _gather(self) -> None:
         state: TrainingState = self._model.state
         notes: list[Any] = [None] * self.count
-        own = (state.gaussians.num_gaussians, state.densification.get("peak", 0), state.trained_focal)
-        dist.all_gather_object(notes, own)
+        note = (state.gaussians.num_gaussians, state.densification.get("peak", 0), state.trained_focal)
+        dist.all_gather_object(notes, note)
         self.sharded.sizes, peaks, spans = map(list, zip(*notes))
         state.pruning["peak"] = max(state.pruning["peak"], sum(peaks))
         if lows := [span for span in spans if span is not None]:
             state.trained_focal = min(low for low, _ in lows), max(high for _, high in lows)
         nothing = [0] * self.count
         received = self.sharded.sizes if self.rank == 0 else nothing
-        self._change_rows([own[0], *nothing[1:]], received, waits=self.rank > 0)
+        self._change_rows([note[0], *nothing[1:]], received, waits=self.rank > 0)
         self._model.source = GaussianSource(state.gaussians)
 
     def _scatter(self) -> None:

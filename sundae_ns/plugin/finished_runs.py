@@ -83,7 +83,7 @@ class Opened:
     @property
     def scene(self) -> str:
         """Name of the capture's folder, or of the one around it that ``sundae run`` has made."""
-        return next(part for part in self.capture.resolve().parts[::-1] if part != "capture" and part[-5:] != ".json")
+        return next(name for name in self.capture.resolve().parts[::-1] if name != "capture" and name[-5:] != ".json")
 
 
 @usual_defaults()

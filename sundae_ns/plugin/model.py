@@ -111,7 +111,7 @@ class SundaeModel(SplatfactoModel):
         self.state, self.train_callbacks, self._start = build(config, self.num_train_data, self.seed_points, frame)
         self.gauss_params, self.networks = cast(Any, self.state.gaussians.data), self.state.networks
         self.source = GaussianSource(self.state.gaussians)
-        self.exposure_compensation = next(one for one in self.train_callbacks if isinstance(one, ExposureCompensation))
+        self.exposure_compensation = next(cb for cb in self.train_callbacks if isinstance(cb, ExposureCompensation))
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
         self.losses = StepLosses(config, self.ssim, self.num_train_data)
@@ -254,10 +254,10 @@ class SundaeModel(SplatfactoModel):
         settings = self.render_settings(training=False)
         compensated = settings if visible.compensate else replace(settings, head=None)
         images = self._replay.render(visible.source, camera, background, compensated)
-        whole = self.state.gaussians.replaced({})
-        drawn = whole if visible.mask is None else visible.source.gaussians
-        values = partial(self._response.values, whole, self.viewer_controls.gaussians_key, self.config.pruning)
-        late = late_outputs(images, drawn, whole, visible.mask, camera, settings, values)
+        gaussians = self.state.gaussians.replaced({})
+        drawn = gaussians if visible.mask is None else visible.source.gaussians
+        values = partial(self._response.values, gaussians, self.viewer_controls.gaussians_key, self.config.pruning)
+        late = late_outputs(images, drawn, gaussians, visible.mask, camera, settings, values)
         late["background"] = background.expand(camera.height, camera.width, 3)
         return late
 
@@ -273,7 +273,7 @@ class SundaeModel(SplatfactoModel):
 
     def count_curve(self) -> list[CurvePoint]:
         """The curve by which trials have chosen the number of Gaussians; empty without them."""
-        return [point for one in self.train_callbacks if isinstance(one, Trials) for point in one.curve()]
+        return [point for cb in self.train_callbacks if isinstance(cb, Trials) for point in cb.curve()]
 
     # ----------------------------------------------------------------------------------------------------- training
 
@@ -363,8 +363,8 @@ class SundaeModel(SplatfactoModel):
         target = self.truth(batch, outputs)
         metrics = {"gaussian_count": float(self.source.total)}
         for suffix, image in (("", outputs["rgb"]), ("_base", outputs["base_rgb"])):
-            found = asdict(quality_of(image, target, self.lpips))
-            metrics |= {name + suffix: value for name, value in found.items() if value is not None}
+            figures = asdict(quality_of(image, target, self.lpips))
+            metrics |= {name + suffix: value for name, value in figures.items() if value is not None}
         return metrics, {"img": torch.cat([target, outputs["rgb"]], dim=1), "base": outputs["base_rgb"]}
 
 
@@ -484,7 +484,7 @@ class NerfstudioRun:
 
     def _finish(self, step: int) -> None:
         """Let callbacks report, then print quality, size and the next command."""
-        with self._ranks.whole() as first:
+        with self._ranks.gathered() as first:
             if first:
                 for callback in self.model.train_callbacks:
                     callback.finish(self)

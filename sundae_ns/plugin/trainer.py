@@ -64,8 +64,8 @@ class SundaeTrainerConfig(TrainerConfig):
         from nerfstudio.configs.method_configs import all_methods  # imports the entry points, so not at the top
 
         set_schedule(self, all_methods.get(str(self.method_name)), sys.argv[1:])
-        whole = "" if self.schedule_length == self.max_num_iterations else f" of {self.schedule_length:,}"
-        table = Table("part of training", f"{self.max_num_iterations:,}{whole} steps")
+        total = "" if self.schedule_length == self.max_num_iterations else f" of {self.schedule_length:,}"
+        table = Table("part of training", f"{self.max_num_iterations:,}{total} steps")
         for row in schedule_table(self):
             table.add_row(*row)
         CONSOLE.print(table)
@@ -160,7 +160,7 @@ class SundaeTrainer(Trainer):
         """Evaluate on the first rank if it is due."""
         every = ("steps_per_eval_batch", "steps_per_eval_image", "steps_per_eval_all_images")
         if any(step_check(step, getattr(self.config, name)) for name in every):
-            with self.ranks.whole() as first:
+            with self.ranks.gathered() as first:
                 if first:
                     super().eval_iteration(step)
 
@@ -286,7 +286,7 @@ class SundaeTrainer(Trainer):
 
     def save_checkpoint(self, step: int) -> None:
         """Save model, optimizers, schedules and random state; only then remove older checkpoints."""
-        with self.ranks.whole() as first:
+        with self.ranks.gathered() as first:
             if not first:
                 return
             state = {

@@ -55,7 +55,7 @@ class RunningMean:
         return copies
 
     @contextmanager
-    def shown(self, weights: Mapping[str, Tensor]) -> Iterator[None]:
+    def applied(self, weights: Mapping[str, Tensor]) -> Iterator[None]:
         """Put the mean, if one fits, in the place of weights for the length of a block."""
         copies = self.replace(weights)
         try:

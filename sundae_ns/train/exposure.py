@@ -107,12 +107,12 @@ class ExposureCompensation(Callback):
             return
         self._sums, self._gains = self._sums.to(photo.device), self._gains.to(photo.device)
         apart = max(int((photo.shape[0] * photo.shape[1] / SAMPLE) ** 0.5), 1)
-        shown, taken = image[::apart, ::apart].detach(), photo[::apart, ::apart] * self._gains[index]
+        rendered, taken = image[::apart, ::apart].detach(), photo[::apart, ::apart] * self._gains[index]
         counts = taken.amax(dim=2, keepdim=True) < CLIPPED
         if mask is not None:
             counts = counts * mask[::apart, ::apart]
-        shown = shown * counts
-        self._sums[index] += torch.stack([(shown * taken).sum(dim=(0, 1)), (shown * shown).sum(dim=(0, 1))])
+        rendered = rendered * counts
+        self._sums[index] += torch.stack([(rendered * taken).sum(dim=(0, 1)), (rendered * rendered).sum(dim=(0, 1))])
 
     def after_step(self, run: TrainingRun) -> None:
         """Update the gains if it is due."""

@@ -340,8 +340,8 @@ def _leaves(config: Any, prefix: str) -> list[str]:
 
 def option(config: Any, name: str) -> Any:
     """Value of the option of a dotted name; None if there is none."""
-    for part in name.split("."):
-        config = config.get(part) if isinstance(config, dict) else getattr(config, part, None)
+    for key in name.split("."):
+        config = config.get(key) if isinstance(config, dict) else getattr(config, key, None)
     return config
 
 

@@ -368,7 +368,7 @@ class Trials(Callback):
 
     def measure(self, run: TrainingRun) -> list[HeldOutQuality]:
         """Quality of the held-out views with the mean of the weights, if there is one."""
-        with self._mean.shown(weights_of(run.state)):
+        with self._mean.applied(weights_of(run.state)):
             return measure_heldout(run, with_fitted=self.progress.stage == "count")
 
     def _go_on(self, run: TrainingRun) -> None:

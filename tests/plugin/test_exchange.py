@@ -167,7 +167,7 @@ def check_gathering(rank):
         assert (float(moments["step"]), len(state.optimizers[name].state)) == (7, 1)
     assert (state.pruning["peak"], state.pruning["num_prunes"], state.trained_focal) == (81, 1, (30.0, 50.0))
     assert (model.source.total, model.source.sizes) == (45, [22, 23])
-    with ranks.whole() as first, ranks.whole() as again:  # a save during a prune
+    with ranks.gathered() as first, ranks.gathered() as again:  # a save during a prune
         assert first == again == (rank == 0)
         assert model.source.total == (45 if first else 23)
         if first:
