@@ -127,7 +127,8 @@ def read_newest(folder: Path) -> tuple[Path, dict[str, Any]]:
 
 def _open_newest(folder: Path) -> tuple[Path, BinaryIO, list[str]]:
     """As :func:`newest_whole`, with the open file, which stays readable after a training has removed it."""
-    before, listed, skipped = None, checkpoints(folder_of(folder)), list[str]()
+    skipped: list[str] = []
+    before, listed = None, checkpoints(folder_of(folder))
     while listed != before:  # else a training has replaced them since they were listed
         skipped.clear()
         for path in reversed(listed):
@@ -198,14 +199,14 @@ def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor]) 
     counts = sorted({state[name].shape[0] for name in expected if name.startswith(_PREFIX)})
     if len(counts) != 1 or counts[0] == 0:
         raise CheckpointError(f"the checkpoint has parameters of {counts} Gaussians; give another")
-    extra, n = state[EXTRA_STATE], counts[0]
-    pruning, strategy = extra["running"].get("pruning"), extra["running"].get("densification")
-    numbers = [extra.get("step"), *(pruning.values() if isinstance(pruning, Mapping) else [None])]
-    if not all(isinstance(value, int) for value in numbers) or not isinstance(strategy, Mapping):
+    (n,), running = counts, state[EXTRA_STATE]["running"]
+    pruning, densification = (running.get(name) for name in ("pruning", "densification"))
+    numbers = [state[EXTRA_STATE].get("step"), *(pruning.values() if isinstance(pruning, Mapping) else [None])]
+    if not all(isinstance(value, int) for value in numbers) or not isinstance(densification, Mapping):
         raise CheckpointError(_NO_CLOCK)
-    for name, value in strategy.items():
-        if isinstance(value, Tensor) and value.ndim > 0 and value.shape[0] != n:
-            raise CheckpointError(f"{name} has {value.shape[0]} rows in a checkpoint of {n} Gaussians; give another")
+    for name, value in densification.items():
+        if isinstance(value, Tensor) and value.ndim > 0 and len(value) != n:
+            raise CheckpointError(f"{name} has {len(value)} rows in a checkpoint of {n} Gaussians; give another")
 
 
 def gaussians_of(loaded: Mapping[str, Any], path: Path) -> Gaussians:
@@ -290,13 +291,13 @@ def _scalar(dtype: np.dtype[Any], content: bytes) -> Any:
 
 def _check_tensors(loaded: Any) -> None:
     """Refuse tensors larger than their storage, whose copy would fill memory."""
-    seen, waiting = {0}, [loaded]
+    visited, waiting = set[int](), [loaded]
     while waiting:
         value = waiting.pop()
         if isinstance(value, Tensor) and value.numel() * value.element_size() > value.untyped_storage().nbytes():
             raise ValueError("it holds a tensor that claims more than it has")
-        if isinstance(value, (Mapping, list, tuple)) and id(value) not in seen:  # lists may hold themselves
-            seen.add(id(value))
+        if isinstance(value, (Mapping, list, tuple)) and id(value) not in visited:  # lists may hold themselves
+            visited.add(id(value))
             waiting += value.values() if isinstance(value, Mapping) else value
 
 

@@ -59,11 +59,11 @@ def similarity(params: Mapping[str, Tensor], transform: Tensor, scale: float) ->
     others become ``[..., N, C]``, means in their own dtype.
     """
     rotation, translation = transform[..., :3].to(params["means"]), transform[..., None, :, 3].to(params["means"])
-    moved = dict(params)
-    moved["means"] = scale * (params["means"] @ rotation.mT + translation)
     # An ellipsoid is the same after a point reflection.
     proper = rotation * rotation.det().sign()[..., None, None]
     turn = quaternions(proper.double().reshape(-1, 3, 3)).reshape(*rotation.shape[:-2], 1, 4)
+    moved = dict(params)
+    moved["means"] = scale * (params["means"] @ rotation.mT + translation)
     moved["scales"] = params["scales"] + math.log(scale)
     moved["quats"] = multiply_quaternions(turn.to(params["quats"]), params["quats"])
     moved["features_rest"] = rotate_spherical_harmonics(params["features_rest"], rotation)
@@ -111,9 +111,10 @@ def upward(means: Tensor, convention: Direction) -> tuple[Direction, bool]:
     share = np.where(np.abs(above - below) > 0.6 * (above + below), 1 - above - below, 0)
     normals = np.where(above < below, -normals.T, normals.T)
     for direction, least in ((convention, 0.2), ((0.0, 0.0, 1.0), 0.4), ((0.0, 1.0, 0.0), 0.4)):
-        x, y, z = largest = normals[:, (share * (direction @ normals > 0.7)).argmax()]
-        if (share * (direction @ normals > 0.7)).max() >= least:
-            return direction if direction @ largest > 0.99 else (float(x), float(y), float(z)), True
+        near = share * (direction @ normals > 0.7)  # within 45 degrees
+        normal = normals[:, near.argmax()]
+        if near.max() >= least:
+            return direction if direction @ normal > 0.99 else tuple(normal.tolist()), True
     return convention, False
 
 

@@ -39,9 +39,9 @@ _UNREAD = {
     **dict.fromkeys(".rar .7z .tar .tgz .xz .zst".split(), "is an archive; unpack it, and give the scene in it"),
 }
 _READERS: dict[Kind | None, Callable[[Path], Any]] = {"spz": read_spz, "sog": read_sog, "glb": read_glb}
+_READERS |= {"splat": read_splat, "ksplat": read_ksplat, "gsplat": read_gsplat}
 _WRITERS: dict[str, Callable[..., None]] = {".spz": write_spz, ".sog": write_sog, ".glb": write_glb}
 _WRITERS[".ply"] = lambda path, gaussians, marks: write_ply(path, gaussians, comments=comments_of(marks))
-_READERS |= {"splat": read_splat, "ksplat": read_ksplat, "gsplat": read_gsplat}
 # In nerfstudio and in gsplat's trainer, z points up; in a 3DGS .ply, -y does.
 _MODEL_UP, _PLY_UP = (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)
 UPRIGHT = torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
@@ -94,8 +94,8 @@ def refuse(path: Path, *, packed: str | None = None, primitives: str | None = No
         raise CheckpointError(f"{path} is a packed scene; {packed}")
     if kind in PRIMITIVES and primitives is not None:
         raise CheckpointError(f"{path} is a {PRIMITIVES[kind]}; {primitives}")
-    if kind is None and (other := unread(path)) is not None:
-        raise CheckpointError(f"{path} {other}")
+    if kind is None and (reason := unread(path)) is not None:
+        raise CheckpointError(f"{path} {reason}")
 
 
 def read_gaussian_file(path: Path) -> tuple[Sanitised, Marks]:
@@ -120,8 +120,8 @@ def up_of(path: Path, means: Tensor, marks: Marks) -> Direction:
     kind = kind_of_gaussians(path)
     up = _MODEL_UP if kind == "gsplat" or marks.in_model_frame else _PLY_UP
     if marks.up is None and not marks.in_model_frame and kind != "glb":
-        up, shown = upward(means, up)
-        why = "its largest plane shows" if shown else "files of its kind have"
+        up, by_ground = upward(means, up)
+        why = "its largest plane shows" if by_ground else "files of its kind have"
         _log.warning("%s states no upward direction; it is %.2g %.2g %.2g, as %s", path, *up, why)
     return marks.up or up
 
@@ -143,9 +143,9 @@ def read_gaussians(path: Path) -> tuple[dict[str, Tensor], bool]:
     as harmonics; and whether coordinates are those of nerfstudio's model, not of a capture. ``CheckpointError`` for no
     such file, no Gaussians, or another format; ``PackError`` for a damaged pack.
     """
-    wanted = "give a .ckpt file, the folder of them, or a .ply"
+    remedy = "give a .ckpt file, the folder of them, or a .ply"
     if not path.exists():
-        raise CheckpointError(f"{path} does not exist; {wanted}")
+        raise CheckpointError(f"{path} does not exist; {remedy}")
     if kind_of_gaussians(path) is not None:
         try:
             sanitised, marks = read_gaussian_file(path)
@@ -159,18 +159,17 @@ def read_gaussians(path: Path) -> tuple[dict[str, Tensor], bool]:
         from sundae_ns.io.pack.packed_scene import read_scene  # its decoder needs a compiler, which other files do not
 
         packed = read_scene(path)
-        model, source = ((packed.meta.get(key) or {}) for key in ("model", "source"))
+        model, params = packed.meta.get("model"), {name: packed.gaussians[name] for name in SPLAT_NAMES}
         logits = isinstance(model, dict) and model.get("sh_degree") == 0
-        params = {name: packed.gaussians[name] for name in SPLAT_NAMES}
-        in_model_frame = not isinstance(source, dict) or source.get("model_frame") is not False
-        return dict(Gaussians(params, "logits" if logits else "harmonics").as_harmonics()), in_model_frame
+        gaussians = Gaussians(params, "logits" if logits else "harmonics").as_harmonics()
+        return dict(gaussians), (packed.meta.get("source") or {}).get("model_frame") is not False
     refuse(path)
     if not path.is_dir():
         loaded = checkpoint.read(path)
     elif checkpoint.checkpoints(checkpoint.folder_of(path)):
         path, loaded = checkpoint.read_newest(path)
     else:
-        raise CheckpointError(f"{path} holds no checkpoint; {wanted}")
+        raise CheckpointError(f"{path} holds no checkpoint; {remedy}")
     return dict(usable(checkpoint.gaussians_of(loaded, path), path).gaussians.as_harmonics()), True
 
 

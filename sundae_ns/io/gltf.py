@@ -45,9 +45,10 @@ _KNOWN = {EXTENSION, _SPZ, _INSTANCING, _VISIBILITY, "KHR_mesh_quantization", "g
 _SRGB = "srgb_rec709_display"
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
-_MOST_NODES = 10_000
+_MOST_NODES, _PLACED_AT_ONCE = 10_000, 1000  # nodes of a scene, and instances; transforms that are applied at once
 _READ, _PLACE = 1 << 18, 1 << 12  # bytes that take as long as to read a primitive, and as to place it
 _TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0  # OpenGL's numbers: types, a target, a mode
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _FROM_MODEL = torch.tensor([[-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 0.0]])  # its own inverse
 _FROM_PLY = torch.tensor([[-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]])  # its own inverse
@@ -77,29 +78,29 @@ def write_glb(path: Path, params: Mapping[str, Tensor], marks: Marks = UNMARKED)
     rest = gaussians["features_rest"].unbind(dim=1)
     attributes |= dict(zip(semantics(sh_degree(gaussians["features_rest"])), rest, strict=True))
     stated = {name: value for name, value in zip(_MARKS, marks, strict=True) if value}
-    accessors, buffer_views, buffer = list[dict[str, Any]](), list[dict[str, int]](), bytearray()
+    accessors: list[dict[str, Any]] = []
+    buffer_views: list[dict[str, int]] = []
+    buffer = bytearray()
     types = {number: name for name, number in _TYPES.items()}
     for name, value in attributes.items():
         data = value.contiguous().numpy().tobytes()  # a multiple of four bytes
         accessor = {"bufferView": len(accessors), "count": len(value), "type": types[value.shape[1]]}
         is_float = value.is_floating_point()
-        accessor |= {"componentType": 5126 if is_float else 5121, "normalized": not is_float}
+        accessor |= {"componentType": _FLOAT if is_float else _BYTE, "normalized": not is_float}
         if name == "POSITION":  # as glTF demands
             accessor |= {"min": value.amin(dim=0).tolist(), "max": value.amax(dim=0).tolist()}
         accessors.append(accessor)
-        # The target is ARRAY_BUFFER.
-        buffer_views.append({"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data), "target": 34962})
+        buffer_views.append({"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data), "target": _ARRAY_BUFFER})
         buffer += data
     look = {"kernel": "ellipse", "colorSpace": _SRGB, "projection": "perspective", "sortingMethod": "cameraDistance"}
     indices = {name: i for i, name in enumerate(attributes)}
-    primitive = {"attributes": indices, "mode": 0, "extensions": {EXTENSION: look}}  # 0 stands for points
     document = {
         "asset": {"version": "2.0", "generator": "sundae_ns", **({"extras": {_OURS: stated}} if stated else {})},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive]}],
+        "meshes": [{"primitives": [{"attributes": indices, "mode": _POINTS, "extensions": {EXTENSION: look}}]}],
         "accessors": accessors,
         "bufferViews": buffer_views,
         "buffers": [{"byteLength": len(buffer)}],
@@ -126,13 +127,15 @@ def read_glb(path: Path) -> tuple[dict[str, Tensor], Marks]:
             stated = [document["asset"].get("extras", {}).get(_OURS, {}).get(name) for name in _MARKS]
             antialiased, in_model_frame = (value is True for value in stated[:2])
             up, offset = (vector(" ".join(map(str, value or ()))) for value in stated[2:])
-            parts, unpacked = [], 0
+            parts: list[dict[str, Tensor]] = []
+            unpacked = 0  # bytes
             for primitive, transforms in _primitives(document, binary):
                 gaussians, marked = _read_primitive(document, binary, primitive)
                 antialiased |= marked.antialiased
                 unpacked += _READ + len(transforms) * (_PLACE + sum(value.nbytes for value in gaussians.values()))
                 afford(unpacked, path.stat().st_size)
-                parts += [_placed(gaussians, part) for part in np.split(transforms, range(1000, len(transforms), 1000))]
+                starts = range(_PLACED_AT_ONCE, len(transforms), _PLACED_AT_ONCE)
+                parts += [_placed(gaussians, some) for some in np.split(transforms, starts)]
         except (AttributeError, IndexError, KeyError, TypeError) as error:
             raise ValueError("its JSON is not that of a glTF scene") from error
         if not parts:
@@ -147,7 +150,8 @@ def _chunks(path: Path) -> tuple[dict[str, Any], memoryview]:
     magic, version, length = _HEADER.unpack_from(data)
     if magic != b"glTF" or version != 2 or length > len(data):
         raise ValueError("its header is not that of a whole glTF 2.0 file")
-    start, chunks = _HEADER.size, {_BINARY: data[:0]}
+    chunks = {_BINARY: data[:0]}
+    start = _HEADER.size
     while start < length:
         count, kind = _CHUNK.unpack_from(data, start)
         start += _CHUNK.size + count
@@ -160,27 +164,27 @@ def _chunks(path: Path) -> tuple[dict[str, Any], memoryview]:
 def _primitives(document: Json, binary: memoryview) -> Iterator[tuple[Json, Transforms]]:
     """Primitives with Gaussians that the scene shows, each once, and the transforms of all nodes that show it."""
     nodes = document.get("nodes", [])
-    seen: set[int] = set()
-    shown: list[tuple[Json, int]] = []  # nodes after their parents, and the positions of these
+    visited: set[int] = set()
+    visible: list[tuple[Json, int]] = []  # nodes after their parents, and the positions of these
 
     def visit(indices: list[Any], parent: int) -> None:
         for index in indices:
-            if _index(index) in seen or len(seen) == _MOST_NODES:
+            if _index(index) in visited or len(visited) == _MOST_NODES:
                 raise ValueError(f"a node has two parents or is below itself, or it has over {_MOST_NODES:,} nodes")
-            seen.add(index)
+            visited.add(index)
             if nodes[index].get("extensions", {}).get(_VISIBILITY, {}).get("visible") is not False:
-                shown.append((nodes[index], parent))
+                visible.append((nodes[index], parent))
 
     if "scenes" in document:
         visit(document["scenes"][_index(document.get("scene", 0))].get("nodes", []), -1)
     else:
-        below = {index for node in nodes for index in node.get("children", [])}
-        visit([index for index in range(len(nodes)) if index not in below], -1)
-    for i, (node, _) in enumerate(shown):
+        children = {index for node in nodes for index in node.get("children", [])}
+        visit([index for index in range(len(nodes)) if index not in children], -1)
+    for i, (node, _) in enumerate(visible):
         visit(node.get("children", []), i)
-    transforms = _below_parents([node for node, _ in shown]) if shown else np.empty((0, 4, 4))
+    transforms = _local_transforms([node for node, _ in visible]) if visible else np.empty((0, 4, 4))
     by_mesh, instances = dict[int, list[Transforms]](), 0
-    for i, (node, parent) in enumerate(shown):
+    for i, (node, parent) in enumerate(visible):
         transforms[i] = transforms[parent] @ transforms[i] if parent >= 0 else transforms[i]
         if "mesh" in node:
             accessors = node.get("extensions", {}).get(_INSTANCING, {}).get("attributes", {}).items()
@@ -188,13 +192,12 @@ def _primitives(document: Json, binary: memoryview) -> Iterator[tuple[Json, Tran
             instances += max(map(len, parts.values()), default=1)
             if instances > _MOST_NODES or len({*map(len, parts.values())}) > 1:
                 raise ValueError(f"its instances of meshes are over {_MOST_NODES:,}, or have unequal accessors")
-            placed = transforms[i] @ _transforms(parts) if parts else transforms[i : i + 1]
-            by_mesh.setdefault(_index(node["mesh"]), []).append(placed)
-    for mesh, each in by_mesh.items():
-        placed = np.concatenate(each)
+            of_node = transforms[i] @ _transforms(parts) if parts else transforms[i : i + 1]
+            by_mesh.setdefault(_index(node["mesh"]), []).append(of_node)
+    for mesh, of_nodes in by_mesh.items():
         for primitive in document["meshes"][mesh]["primitives"]:
             if EXTENSION in primitive.get("extensions", {}):
-                yield primitive, placed
+                yield primitive, np.concatenate(of_nodes)
 
 
 def _index(value: object) -> int:
@@ -204,13 +207,13 @@ def _index(value: object) -> int:
     return value
 
 
-def _below_parents(nodes: list[Json]) -> Transforms:
-    """The nodes' own transforms ``[N, 4, 4]``."""
+def _local_transforms(nodes: list[Json]) -> Transforms:
+    """Transforms ``[N, 4, 4]`` of nodes to the coordinates of their parents."""
     parts = {}
-    for name, none in {"translation": [0] * 3, "rotation": [0, 0, 0, 1], "scale": [1] * 3, "matrix": [0] * 16}.items():
-        parts[name] = np.array([node.get(name, none) for node in nodes], np.float64)
-        if parts[name].shape[1:] != (len(none),) or not np.isfinite(parts[name]).all():
-            raise ValueError(f"the {name} of a node is not {len(none)} numbers")
+    for name, usual in {"translation": [0] * 3, "rotation": [0, 0, 0, 1], "scale": [1] * 3, "matrix": [0] * 16}.items():
+        parts[name] = np.array([node.get(name, usual) for node in nodes], np.float64)
+        if parts[name].shape[1:] != (len(usual),) or not np.isfinite(parts[name]).all():
+            raise ValueError(f"the {name} of a node is not {len(usual)} numbers")
     matrices = parts.pop("matrix").reshape(-1, 4, 4).transpose(0, 2, 1)
     return np.where([[["matrix" in node]] for node in nodes], matrices, _transforms(parts))
 

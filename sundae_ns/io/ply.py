@@ -202,11 +202,13 @@ class _Ply:
     """A .ply, whose header is checked before anything is allocated by it."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.text = path, False
+        self.path = path
+        self.text = False  # whether rows are text
         # For each element the bytes (in text, the lines) before its rows, the number of these, and their dtype.
         self.elements: dict[str, tuple[int, int, np.dtype[Any]]] = {}
         with reading(path, "a complete .ply file"):
-            self.header, order = _header(path), ""
+            self.header = _header(path)
+            order = ""  # of bytes
             stated: dict[str, tuple[int, list[tuple[str, str]]]] = {}
             for line in self.header.splitlines():
                 match line.decode("latin-1").lower().split():
@@ -338,7 +340,6 @@ def read_ply(path: Path) -> dict[str, Tensor]:
     degree = sh_degree_of(rest // 3) if rest % 3 == 0 else None
     if degree is None or not present.issuperset(f"f_rest_{i}" for i in range(rest)):
         raise DataError(f"{path} has {rest} f_rest properties, which fit no SH degree; export it again.")
-
     params = {name: _columns(rows, names) for name, names in columns.items() if name != "means"}
     params["means"] = _columns(rows, columns["means"], np.float64 if rows["x"].dtype.itemsize == 8 else np.float32)
     alphas, wide = params["opacities"], (params["scales"] > 0).all()
@@ -434,7 +435,8 @@ def read_point_cloud(path: Path, *, precise: bool = False) -> tuple[Tensor, Tens
         return points, torch.full((len(points), 3), 128, dtype=torch.uint8)
     colors = _columns(rows, channels)
     if channels == _COLUMNS["features_dc"]:
-        white, colors = 1.0, sh_to_rgb(colors)
+        colors = sh_to_rgb(colors)
+        white = 1.0
     else:
         largest = float(colors[colors.isfinite()].max()) if bool(colors.isfinite().any()) else 0.0
         is_float = rows[channels[0]].dtype.kind == "f"

@@ -91,9 +91,8 @@ def prunes_before(path: Path, step: int) -> list[dict[str, Any]]:
     A file that cannot be read is renamed to ``*.damaged.json``, because it should not end a training.
     """
     try:
-        return [record for record in json.loads(regular(path).read_text(encoding="utf-8")) if record["step"] < step]
-    except FileNotFoundError:
-        pass
+        with suppress(FileNotFoundError):
+            return [record for record in json.loads(regular(path).read_text(encoding="utf-8")) if record["step"] < step]
     except (ValueError, TypeError, KeyError):
         path.replace(path.with_suffix(".damaged.json"))
     return []

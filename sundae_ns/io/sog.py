@@ -87,7 +87,7 @@ def write_streamed(folder: Path, levels: Sequence[Mapping[str, Tensor]], marks: 
     chunks: list[tuple[int, list[NDArray[np.int64]]]] = []  # levels, and the rows of each leaf
     newest: dict[int, int] = {}  # chunk of a level that is not full
 
-    def placed(level: int, rows: NDArray[np.int64]) -> dict[str, int]:
+    def add_leaf(level: int, rows: NDArray[np.int64]) -> dict[str, int]:
         if level not in newest or sum(map(len, chunks[newest[level]][1])) + len(rows) > _CHUNK:
             newest[level] = len(chunks)
             chunks.append((level, []))
@@ -96,14 +96,14 @@ def write_streamed(folder: Path, levels: Sequence[Mapping[str, Tensor]], marks: 
         return {"file": newest[level], "offset": sum(map(len, leaves[:-1])), "count": len(rows)}
 
     def node(rows: list[NDArray[np.int64]]) -> dict[str, Any]:
-        each = list(zip(arrays, rows, strict=True))
-        low, high = (np.concatenate([level[end][some] for level, some in each]) for end in ("min", "max"))
+        levels = list(zip(arrays, rows, strict=True))
+        low, high = (np.concatenate([level[end][some] for level, some in levels]) for end in ("min", "max"))
         bound = {"min": low.min(axis=0).tolist(), "max": high.max(axis=0).tolist()}
         centres = arrays[0]["means"][rows[0]]
         axis = np.ptp(centres, axis=0).argmax()
-        below = [level["means"][some, axis] < np.median(centres[:, axis]) for level, some in each]
+        below = [level["means"][some, axis] < np.median(centres[:, axis]) for level, some in levels]
         if len(centres) <= _LEAF or not below[0].any():
-            return {"bound": bound, "lods": {str(i): placed(i, some) for i, some in enumerate(rows) if len(some)}}
+            return {"bound": bound, "lods": {str(i): add_leaf(i, some) for i, some in enumerate(rows) if len(some)}}
         halves = ([some[low == half] for some, low in zip(rows, below, strict=True)] for half in (True, False))
         return {"bound": bound, "children": [node(half) for half in halves]}
 
@@ -203,7 +203,8 @@ def _finest_level(path: Path, entry: Entry, size: int) -> tuple[dict[str, Tensor
     meta = parsed_json(entry(STREAMED))
     if (version := str(meta.get("version", 1))) != "1":
         raise DataError(f"{path} has version {version} of streamed SOG, this program reads 1; update it")
-    files, nodes = dict[str, list[tuple[int, int]]](), [meta["tree"]]
+    files: dict[str, list[tuple[int, int]]] = {}  # offset and number of the rows of each leaf
+    nodes = [meta["tree"]]
     while nodes:
         node = nodes.pop()
         nodes += node.get("children", ())
@@ -212,7 +213,8 @@ def _finest_level(path: Path, entry: Entry, size: int) -> tuple[dict[str, Tensor
             files.setdefault(meta["filenames"][finest["file"]], []).append((finest["offset"], finest["count"]))
     if meta.get("environment"):
         files[meta["environment"]] = []
-    parts, marks, unpacked = list[dict[str, Tensor]](), Marks(), 0
+    parts: list[dict[str, Tensor]] = []
+    marks, unpacked = UNMARKED, 0
     for file, leaves in files.items():
         part, marks = _scene(path, lambda name, file=file: entry(file.removesuffix(META) + name), size)  # type: ignore[misc]
         unpacked += sum(value.nbytes for value in part.values())
@@ -240,13 +242,13 @@ def _bundled(bundle: zipfile.ZipFile, size: int, *, inner: bool = False) -> tupl
     """What reads an entry of a zip, whose files may be in a folder or in another zip; and whether it is streamed."""
     names = {name: PurePosixPath(name.replace("\\", "/")).name for name in bundle.namelist()}  # some are of Windows
     streamed = STREAMED in names.values()
-    found = [name for name, last in names.items() if last == (STREAMED if streamed else META)]
+    metas = [name for name, last in names.items() if last == (STREAMED if streamed else META)]
     scenes = [name for name, last in names.items() if last.lower().endswith(".sog") and not last.startswith(".")]
-    if len(scenes) == 1 and not found and not inner:
+    if len(scenes) == 1 and not metas and not inner:
         return _bundled(zipfile.ZipFile(io.BytesIO(_zip_entry(bundle, size, "", scenes[0]))), size, inner=True)
-    if len(found) != 1:
-        raise ValueError(f"it holds {len(found)} {META} and {len(scenes)} .sog, not one of them; unzip other scenes")
-    return partial(_zip_entry, bundle, size, found[0].removesuffix(STREAMED if streamed else META)), streamed
+    if len(metas) != 1:
+        raise ValueError(f"it holds {len(metas)} {META} and {len(scenes)} .sog, not one of them; unzip other scenes")
+    return partial(_zip_entry, bundle, size, metas[0].removesuffix(STREAMED if streamed else META)), streamed
 
 
 def _zip_entry(bundle: zipfile.ZipFile, size: int, folder: str, name: str) -> bytes:

@@ -84,7 +84,8 @@ def read_ksplat(path: Path) -> dict[str, Tensor]:
         major, minor, stored, used, _, _, level, low, high = _HEADER.unpack_from(data)
         if (major, minor) != (0, 1) or level > 2 or used > stored:
             raise ValueError(f"version {major}.{minor}, level {level}, not version 0.1 of level 0, 1 or 2")
-        start, parts = _HEADER_BYTES + stored * _SECTION_BYTES, []
+        start = _HEADER_BYTES + stored * _SECTION_BYTES
+        parts: list[dict[str, Tensor]] = []
         for i in range(used):
             section = _SECTION.unpack_from(data, _HEADER_BYTES + i * _SECTION_BYTES)
             part, start = _section(data, start, level, (low or -1.5, high or 1.5), section)
@@ -99,9 +100,9 @@ def _section(
     used, stored, size, buckets, width, center_bytes, limit, _, full, partial, degree = section
     if used > stored or degree > 2 or (level and (center_bytes != 12 or full + partial != buckets)):
         raise ValueError("a section's SH degree, Gaussians and buckets do not fit together")
-    number, coefficients = "<f2" if level else "<f4", (degree + 1) ** 2 - 1
-    columns = [("means", "<u2" if level else "<f4", 3), ("widths", number, 3), ("quats", number, 4), ("rgba", "u1", 4)]
-    kind = np.dtype([*columns, ("harmonics", _SH_DTYPES[level], 3 * coefficients)])
+    real = "<f2" if level else "<f4"
+    columns = [("means", "<u2" if level else "<f4", 3), ("widths", real, 3), ("quats", real, 4), ("rgba", "u1", 4)]
+    kind = np.dtype([*columns, ("harmonics", _SH_DTYPES[level], 3 * ((degree + 1) ** 2 - 1))])
     centers = start + 4 * partial
     first = centers + center_bytes * buckets
     # numpy refuses what reaches beyond the file, before larger arrays are made of it.

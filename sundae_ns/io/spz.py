@@ -137,8 +137,8 @@ def _streams(content: bytes, sizes: list[int]) -> tuple[list[bytes], bytes]:
     """The parts of a file of version 4, which have these sizes, and its extensions."""
     from zstandard import ZstdDecompressor
 
-    number, (table,) = content[15], struct.unpack_from("<I", content, 16)
-    offset, parts = table + 16 * number, []
+    number, table = struct.unpack_from("<BI", content, 15)  # of streams, and the offset of their table
+    offset, parts = table + 16 * number, list[bytes]()
     for i, size in enumerate(sizes):
         stored, unpacked = struct.unpack_from("<QQ", content, table + 16 * i)
         if number != len(sizes) or unpacked != size or offset + stored > len(content):

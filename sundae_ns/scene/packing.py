@@ -38,7 +38,6 @@ def scene_of(packed: PackedScene) -> Scene:
     meta = {name: packed.meta[name] for name in ("source", "frame", "capture") if packed.meta.get(name) is not None}
     if not is_frame(meta.get("frame")):
         meta.pop("frame", None)
-    source = meta.get("source")
     up, start = start_of(packed.meta)
     cameras, arrays = tuple[Camera, ...](), packed.cameras
     if arrays is not None:
@@ -53,7 +52,7 @@ def scene_of(packed: PackedScene) -> Scene:
         cameras=cameras,
         up=up,
         start=start,
-        in_model_frame=not isinstance(source, dict) or source.get("model_frame") is not False,
+        in_model_frame=meta.get("source", {}).get("model_frame") is not False,
         meta=meta,
     )
 

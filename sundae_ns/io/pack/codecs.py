@@ -321,10 +321,8 @@ class HeadCodec:
 
     def scaled(self, factor: float, head: Mapping[str, Tensor]) -> HeadCodec:
         """Steps of the same ratios for a head, larger by a factor, but no output channel beyond its largest share."""
-        rows = {}
-        for name, row in self.rows.items():
-            largest = weight_steps(_on_cpu(head[name]), _LARGEST_SHARE)
-            rows[name] = torch.minimum(row * factor, torch.maximum(row, largest))
+        largest = {name: weight_steps(_on_cpu(head[name]), _LARGEST_SHARE) for name in self.rows}
+        rows = {name: torch.minimum(row * factor, torch.maximum(row, largest[name])) for name, row in self.rows.items()}
         return HeadCodec(rows, self.columns)
 
     def steps(self, name: str) -> Tensor:
@@ -366,10 +364,9 @@ class Codecs:
         codecs: dict[str, Rotations | Transform] = {}
         for name, codec in self.gaussians.items():
             step = codec.step * ratios[_STEPS[name]]
+            codecs[name] = Rotations(step)
             if isinstance(codec, Transform):
                 codecs[name] = codec.with_step(step, as_matrix(gaussians[name]))
-            else:
-                codecs[name] = Rotations(step)
         kept = {"position_bits": self.config.position_bits, "block": self.config.block}
         of_head = None if self.head is None else self.head.scaled(ratios["head_step"], head)
         return Codecs(replace(config, **kept), self.blocks, codecs, of_head)  # type: ignore[arg-type]
@@ -377,11 +374,8 @@ class Codecs:
     @torch.no_grad()
     def rounded(self, gaussians: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The Gaussians that a reader decodes, in the order of these codecs; positions are unchanged."""
-        result = dict(gaussians)
-        for name, codec in self.gaussians.items():
-            values = gaussians[name]
-            result[name] = codec.rounded(values.reshape(len(values), -1)).reshape(values.shape)
-        return result
+        rounded = {name: codec.rounded(gaussians[name].flatten(1)) for name, codec in self.gaussians.items()}
+        return {**gaussians, **{name: value.reshape(gaussians[name].shape) for name, value in rounded.items()}}
 
     @torch.no_grad()
     def rounded_head(self, head: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -476,8 +470,8 @@ def estimated_bits(codecs: Codecs, gaussians: Mapping[str, Tensor], head: Mappin
 def _of_rows(levels: Tensor) -> Tensor:
     """Bits of levels ``[N, C]``: the mean of each run, and the deviations from it."""
     n, width = levels.shape
-    whole = n // _RUN * _RUN
-    runs = [levels[:whole].reshape(-1, _RUN, width), levels[whole:].reshape(-1, max(n - whole, 1), width)]
+    in_runs = n // _RUN * _RUN
+    runs = [levels[:in_runs].reshape(-1, _RUN, width), levels[in_runs:].reshape(-1, max(n - in_runs, 1), width)]
     total = levels.new_zeros(())
     for run in runs:
         if run.numel():

@@ -29,7 +29,8 @@ import sys
 import zlib
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, suppress
+from contextlib import suppress
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -53,6 +54,8 @@ LIMITS: dict[str, int] = FORMAT["limits"]
 VERSION, MAX_HEADER, SPARE, MAX_RATIO = (LIMITS[name] for name in ("version", "header", "spare", "ratio"))
 MAGIC = b"\x89SUNDAE\n"
 PADDING = "padding"
+naming = partial(reading, kind="a whole packed scene", failure=PackError, remedy="get it again, or pack it again")
+"""Turns every error of reading a packed scene into a ``PackError`` that names the file."""
 _TRIED = 1 << 14  # bytes of a plane that tell whether to deflate it
 _PREAMBLE = struct.Struct("<8sII32s")
 
@@ -81,11 +84,6 @@ class Header(NamedTuple):
     meta: dict[str, Any]
     sections: dict[str, Section]
     size: int
-
-
-def naming(path: Path) -> AbstractContextManager[None]:
-    """Turn every error of reading a packed scene into a ``PackError`` that names the file."""
-    return reading(path, "a whole packed scene", PackError, remedy="get it again, or pack it again")
 
 
 def _unique_by(_: Any, key: str | int, items: list[Any], __: Any) -> Iterator[jsonschema.ValidationError]:

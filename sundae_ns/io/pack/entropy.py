@@ -42,7 +42,7 @@ _RATES = (65536 * 5 // (5 * np.arange(256) + 8)).astype(np.int32)
 @inlined  # as _decided and _number, so that the four numbers of the coder stay in registers: half the time
 def _coded(coder, stream, chance, bit):  # type: ignore[no-untyped-def]
     """Write a bit that is 1 with ``chance`` of 65536, or read it if ``bit`` is -1; the bit, and the coder after it."""
-    low, high, code, place = coder
+    low, high, code, position = coder
     reading = bit < 0
     reach = high - low
     middle = low + (reach >> 16) * chance + (((reach & 0xFFFF) * chance) >> 16)
@@ -54,13 +54,13 @@ def _coded(coder, stream, chance, bit):  # type: ignore[no-untyped-def]
         low = middle + 1
     while (low ^ high) >> 24 == 0:
         if reading:
-            code = ((code << 8) & _MASK) | (stream[place] if place < len(stream) else 0)
+            code = ((code << 8) & _MASK) | (stream[position] if position < len(stream) else 0)
         else:
-            stream[place] = high >> 24
-        place += 1
+            stream[position] = high >> 24
+        position += 1
         low = (low << 8) & _MASK
         high = ((high << 8) & _MASK) | 255
-    return bit, (low, high, code, place)
+    return bit, (low, high, code, position)
 
 
 def _chances(contexts: int, decisions: int) -> tuple[Array, ...]:
@@ -72,7 +72,7 @@ def _chances(contexts: int, decisions: int) -> tuple[Array, ...]:
 @inlined
 def _decided(coder, stream, chances, kinds, row, node, bit):  # type: ignore[no-untyped-def]
     """Code the decision ``node`` with the mix of its chances in four contexts, and adapt them; the bit, the coder."""
-    model, weights, at_hand = chances
+    model, weights, scratch = chances
     # Unsigned: of other numbers numba asks whether they count from the end.
     a, b = np.uint32(kinds[0] * _NODES + node), np.uint32(kinds[1] * _NODES + node)
     c, d, row = np.uint32(kinds[2] * _NODES + node), np.uint32(kinds[3] * _NODES + node), np.uint32(row)
@@ -80,19 +80,19 @@ def _decided(coder, stream, chances, kinds, row, node, bit):  # type: ignore[no-
     of_c, of_d = _STRETCH[model[c] >> 11], _STRETCH[model[d] >> 11]
     total = of_a * weights[row, 0] + of_b * weights[row, 1] + of_c * weights[row, 2] + of_d * weights[row, 3]
     chance = _SQUASH[min(max(total >> 16, -2047), 2047) + 2047]
-    at_hand[0], at_hand[1], at_hand[2], at_hand[3] = model[a], model[b], model[c], model[d]
-    at_hand[4], at_hand[5], at_hand[6], at_hand[7] = of_a, of_b, of_c, of_d
-    at_hand[8], at_hand[9] = _RATES[model[a] & 127], _RATES[model[b] & 127]
-    at_hand[10], at_hand[11] = _RATES[model[c] & 127], _RATES[model[d] & 127]
+    scratch[0], scratch[1], scratch[2], scratch[3] = model[a], model[b], model[c], model[d]
+    scratch[4], scratch[5], scratch[6], scratch[7] = of_a, of_b, of_c, of_d
+    scratch[8], scratch[9] = _RATES[model[a] & 127], _RATES[model[b] & 127]
+    scratch[10], scratch[11] = _RATES[model[c] & 127], _RATES[model[d] & 127]
     bit, coder = _coded(coder, stream, chance << 4, bit)
     # They adapt in lanes; the mix above is scalar, as a decoder waits for it. max(x, y) is y - min(y - x, 0).
-    states, most = load(at_hand, 0), 1 << 19
-    weight = load(weights, row * CONTEXTS) + ((load(at_hand, 4) * (((bit << 12) - chance) * 10) + 0x8000) >> 16)
+    states, most = load(scratch, 0), 1 << 19
+    weight = load(weights, row * CONTEXTS) + ((load(scratch, 4) * (((bit << 12) - chance) * 10) + 0x8000) >> 16)
     store(weights, row * CONTEXTS, minimum(0 - minimum(0 - weight, most), most))
     old = states >> 7
-    moved = minimum(old + ((((bit * 65535 - old) >> 3) * load(at_hand, 8)) >> 13), 65519)
-    store(at_hand, 0, (16 - minimum(16 - moved, 0)) * 128 + minimum((states & 127) + 1, 127))
-    model[a], model[b], model[c], model[d] = at_hand[0], at_hand[1], at_hand[2], at_hand[3]
+    moved = minimum(old + ((((bit * 65535 - old) >> 3) * load(scratch, 8)) >> 13), 65519)
+    store(scratch, 0, (16 - minimum(16 - moved, 0)) * 128 + minimum((states & 127) + 1, 127))
+    model[a], model[b], model[c], model[d] = scratch[0], scratch[1], scratch[2], scratch[3]
     return bit, coder
 
 
@@ -113,16 +113,16 @@ def _number(coder, stream, chances, kinds, first, value, reading):  # type: igno
         if bit == 0:
             break
         digits += 1
-    found = 1
+    magnitude = 1
     for k in range(digits):
         bit = -1 if reading else (size >> (digits - 1 - k)) & 1
         if k < 2 and digits < 15:
-            node = 2 * (17 + 3 * digits + (k + (found & 1) if k else 0)) + negative
+            node = 2 * (17 + 3 * digits + (k + (magnitude & 1) if k else 0)) + negative
             bit, coder = _decided(coder, stream, chances, kinds, first + node, node, bit)
         else:
             bit, coder = _coded(coder, stream, _EVEN, bit)
-        found = 2 * found + bit
-    return -found if negative == 1 else found, coder
+        magnitude = 2 * magnitude + bit
+    return -magnitude if negative == 1 else magnitude, coder
 
 
 @compiled
@@ -197,18 +197,18 @@ def _run_gaps(codes, block, bits, chances, stream, coder, reading):  # type: ign
             bit, coder = _decided(coder, stream, chances, kinds, node, node, bit)
             node = 2 * node + bit
         digits = min(node - 64, 3 * bits)
-        found = min(digits, 1)
+        size = min(digits, 1)
         for k in range(digits - 2, -1, -1):
             bit = -1 if reading else (gap >> k) & 1
             kind = digits - 2 - k
             if kind < 2:
-                node = 64 + (1 if kind == 0 else found & 3)
+                node = 64 + (1 if kind == 0 else size & 3)
                 bit, coder = _decided(coder, stream, chances, kinds, node, node, bit)
             else:
                 bit, coder = _coded(coder, stream, _EVEN, bit)
-            found = 2 * found + bit
+            size = 2 * size + bit
         # A hostile stream must not leave the grid.
-        codes[i] = min(previous + found, (1 << 3 * bits) - 1)
+        codes[i] = min(previous + size, (1 << 3 * bits) - 1)
         last, before = digits, last
         average += digits - (average >> 2)
     return coder
@@ -264,7 +264,7 @@ def _written(run: Callable[..., tuple[int, ...]], size: int, *arguments: Any) ->
 def _read(run: Callable[..., tuple[int, ...]], stream: Stream, *arguments: Any) -> None:
     """Fill the arguments of a loop from a stream; refuse a stream of more or fewer numbers."""
     coder = 0, _MASK, int.from_bytes(bytes(stream[:4]).ljust(4, b"\0"), "big"), 4
-    *_, place = run(*arguments, stream.copy(), coder, True)  # the loop takes no read-only arrays
+    *_, position = run(*arguments, stream.copy(), coder, True)  # the loop takes no read-only arrays
     # A decoder has read four bytes where the encoder wrote the last one.
-    if place - 3 != len(stream):
+    if position - 3 != len(stream):
         raise ValueError("a stream does not end with its last number")
