@@ -65,8 +65,8 @@ def check_suffix(out: Path, suffixes: Iterable[str]) -> str:
 def check_least(**values: tuple[float | None, float]) -> None:
     """Raise ``ConfigError`` for the first option that is given and below its limit: ``steps=(steps, 1)``."""
     for name, (value, least) in values.items():
-        if value is not None and not value >= least:
-            raise ConfigError(f"{name.replace('_', '-')} is {value}; give at least {least}")
+        if value is not None and not least <= value < float("inf"):
+            raise ConfigError(f"{name.replace('_', '-')} is {value}; give {'less, ' * (value > least)}at least {least}")
 
 
 def check_exclusive(**values: object) -> None:

@@ -22,8 +22,7 @@ def world_to_camera(pose: Tensor) -> Tensor:
     """World-to-camera ``[..., 4, 4]``, OpenCV axes, of camera-to-world ``[..., 3, 4]``, OpenGL axes; differentiable."""
     rotation = pose[..., :3] * pose.new_tensor(OPENGL_TO_OPENCV)
     top = torch.cat([rotation.mT, -rotation.mT @ pose[..., 3:]], dim=-1)
-    bottom = pose.new_tensor([[0.0, 0.0, 0.0, 1.0]]).expand(*pose.shape[:-2], 1, 4)
-    return torch.cat([top, bottom], dim=-2)
+    return torch.cat([top, pose.new_tensor([[0.0, 0.0, 0.0, 1.0]]).expand(*pose.shape[:-2], 1, 4)], dim=-2)
 
 
 def world_to_camera_floats(pose: Sequence[float]) -> list[float]:

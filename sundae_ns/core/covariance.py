@@ -36,8 +36,7 @@ def entries_of(params: Mapping[str, Tensor]) -> Tensor:
     scales, quats = params["scales"].detach(), params["quats"].detach()
     result = torch.empty(len(scales), 6, dtype=torch.float64, device=scales.device)
     for rows in chunks(len(scales)):
-        matrices = covariances(scales[rows].double().exp(), quats[rows].double())
-        result[rows] = matrices[:, LOWER[0], LOWER[1]]
+        result[rows] = covariances(scales[rows].double().exp(), quats[rows].double())[:, LOWER[0], LOWER[1]]
     return result
 
 
@@ -128,5 +127,4 @@ def _cholesky(entries: Tensor, least_variance: float) -> tuple[Tensor, ...]:
     ba, ca = yx / a, zx / a
     b = (yy - ba * ba).clamp_min(least_variance).sqrt()
     cb = (zy - ca * ba) / b
-    c = (zz - ca * ca - cb * cb).clamp_min(least_variance).sqrt()
-    return a, b, c, ba, ca, cb
+    return a, b, (zz - ca * ca - cb * cb).clamp_min(least_variance).sqrt(), ba, ca, cb

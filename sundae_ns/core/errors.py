@@ -33,6 +33,9 @@ _STAND_INS |= dict.fromkeys((b"<!doctype html", b"<html"), "is a web page; downl
 class SundaeError(Exception):
     """Base class of all errors that ``sundae_ns`` raises on purpose."""
 
+    def __str__(self) -> str:  # one line, although names of files may have others
+        return re.sub(r"[\0-\x1f\x7f]", lambda odd: repr(odd[0])[1:-1], super().__str__())
+
 
 class ConfigError(SundaeError, ValueError):
     """An option has an invalid value, or two options contradict each other."""

@@ -32,8 +32,7 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
     source = {name: value.detach() for name, value in params.items()}
     device = source["means"].device
     label, w = label.to(device), weight.detach().to(device).double().nan_to_num(0.0, posinf=0.0).clamp_min(0)
-    n = len(label)
-    stays = label == torch.arange(n, device=device)
+    stays = label == torch.arange(len(label), device=device)
     members = (label >= 0).nonzero().squeeze(1)
     group = (stays.cumsum(0) - 1)[label[members]]
     count = int(stays.sum())

@@ -15,9 +15,7 @@ def without_nan(value: Any) -> Any:
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
         return {key: without_nan(inner) for key, inner in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [without_nan(inner) for inner in value]
-    return value
+    return [without_nan(inner) for inner in value] if isinstance(value, (list, tuple)) else value
 
 
 def number(value: float | None, digits: int) -> str:

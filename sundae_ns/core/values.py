@@ -30,8 +30,10 @@ def numbers(values: Any, name: str, *shapes: tuple[int, ...]) -> Tensor:
     return torch.from_numpy(array.astype(np.float64))
 
 
-def whole(value: Any, name: str, least: int = 1) -> int:
-    """A whole number of at least ``least``; ``ConfigError`` for anything else."""
+def whole(value: Any, name: str, least: int = 1, most: int = 2**63 - 1) -> int:
+    """A whole number from ``least`` to ``most``; ``ConfigError`` for anything else."""
+    if isinstance(value, (int, float)) and value > most:
+        raise ConfigError(f"{name} is {value}; give at most {most:,}")
     if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or float(value) % 1 or value < least:
         raise ConfigError(f"{name} is {value!r}; give a whole number, at least {least}")
     return int(value)

@@ -55,14 +55,14 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
         size: width and height of the images, pixels; by default 512, or ``16 sqrt(N)`` for fewer Gaussians.
 
     Raises:
-        ConfigError, DataError: ``n`` or ``size`` is no whole number of at least 1; no Gaussian is finite.
+        ConfigError, DataError: ``n`` (to 10,000) or ``size`` is no whole number; no Gaussian is finite.
 
     >>> import torch, sundae_ns as sn
     >>> scene = sn.Scene.from_points(torch.rand(100, 3), torch.rand(100, 3))
     >>> len(sn.virtual_cameras(scene, 8))
     8
     """
-    n = whole(by_device(VIEWS, scene.device) if n is None else n, "n")
+    n = whole(by_device(VIEWS, scene.device) if n is None else n, "n", most=10_000)
     size = min(SIDE, max(64, 16 * math.isqrt(scene.num_gaussians))) if size is None else size
     gaussians = usable(scene)
     middle, reach = middle_and_reach(gaussians)

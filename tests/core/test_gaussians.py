@@ -30,8 +30,7 @@ def test_an_odd_shape_is_named(name, shape):
 
 
 def test_means_set_the_number_of_primitives():
-    found = odd_shapes(gaussians() | {"means": torch.zeros(N, 4)})
-    assert found == [f"means has shape [{N}, 4]; it must be [{N}, 3]"]
+    assert odd_shapes(gaussians() | {"means": torch.zeros(N, 4)}) == [f"means has shape [{N}, 4]; it must be [{N}, 3]"]
     assert len(odd_shapes(gaussians() | {"means": torch.zeros(6, 3)})) == len(SPLAT_NAMES)
     assert len(odd_shapes(gaussians() | {"means": torch.zeros(())})) == len(SPLAT_NAMES) + 1
 

@@ -345,8 +345,7 @@ def train_a_step(data):
     model.step = 4
     camera, batch = datamanager.next_train(0)
     outputs = model(camera)
-    losses = model.get_loss_dict(outputs, batch, model.get_metrics_dict(outputs, batch))
-    loss = torch.stack(list(losses.values())).sum()
+    loss = torch.stack(list(model.get_loss_dict(outputs, batch, model.get_metrics_dict(outputs, batch)).values())).sum()
     loss.backward()
     assert torch.isfinite(loss)
     model.eval()

@@ -107,8 +107,7 @@ def test_codes_index_the_nearest_number(values):
     assert numbers.shape == (256,)
     assert (np.diff(numbers) >= 0).all()
     distance = np.abs(given_values[:, None].astype(np.float64) - numbers)
-    chosen = distance[np.arange(len(values)), codes]
-    assert (chosen <= distance.min(axis=1) + 1e-6 * np.abs(given_values).max()).all()
+    assert (distance[np.arange(len(values)), codes] <= distance.min(axis=1) + 1e-6 * np.abs(given_values).max()).all()
 
 
 def test_the_codebook_is_better_than_equal_steps():

@@ -38,8 +38,7 @@ def write_model(
     for index, name in enumerate(names):
         moved = stray[1] if stray is not None and stray[0] == index else 0.0
         place = [a - b for a, b in zip((0.3 * index + moved, 0.1, 3.0), origin, strict=True)]
-        camera = 1 + index % len(lenses)
-        images += struct.pack("<i7di", index + 1, 1, 0, 0, 0, *place, camera) + name.encode() + b"\0"
+        images += struct.pack("<i7di", index + 1, 1, 0, 0, 0, *place, 1 + index % len(lenses)) + name.encode() + b"\0"
         images += struct.pack("<Q", observations) + struct.pack("<ddq", 3.0, 4.0, index) * observations
         point = [a + b for a, b in zip((0.1 * index, 0.2, 0.3), origin, strict=True)]
         points += struct.pack("<Q3d3Bd", index, *point, 10, 20, 30, 0.5)
