@@ -46,7 +46,8 @@ def matrix(value: Any, rows: Sequence[int], name: str, where: str) -> np.ndarray
         raise DataError(f"{where}: {name} must have {' or '.join(map(str, rows))} rows of 4 numbers")
     for entry in chain(*value):
         finite(entry, name, where)
-    if abs(np.linalg.det((array := np.array(value, dtype=np.float64))[:3, :3])) < 1e-9:
+    array = np.array(value, dtype=np.float64)
+    if abs(np.linalg.det(array[:3, :3])) < 1e-9:
         raise DataError(f"{where}: {name} is singular, so it is not a camera pose; remove this view")
     return array
 
@@ -75,7 +76,7 @@ def read_json(path: Path) -> dict[str, Any]:
 def check_transforms(path: Path, *, splits: Sequence[str] = ()) -> dict[str, Any]:
     """Contents of a ``transforms.json``, after a check with its lists of ``splits``; ``DataError`` names the entry."""
     meta = read_json(path)
-    frames = listed if isinstance(listed := meta.get("frames"), list) else []
+    frames = meta["frames"] if isinstance(meta.get("frames"), list) else []
     if (count := len(frames)) < 2:
         raise DataError(f"{path} lists {count} image{'s' * (count != 1)}; training needs 2 or more, with their poses")
     _check_values(meta, path.name)

@@ -114,7 +114,8 @@ def write_smaller(images: Path, advance: Advance = lambda _: None, *, masks: boo
     for path in paths:
         image = decoded(path)
         for factor in factors:
-            (folder := images.with_name(f"{images.name}_{factor}")).mkdir(exist_ok=True)
+            folder = images.with_name(f"{images.name}_{factor}")
+            folder.mkdir(exist_ok=True)
             size = max(1, image.width // factor), max(1, image.height // factor)
             image.resize(size, Resampling.NEAREST if masks else Resampling.BOX).save(folder / path.name, **JPEG)
         advance(1)
@@ -144,12 +145,10 @@ def write_capture(
     if masks:
         write_smaller(out / "masks", masks=True)
     model.write(stored)
-    kinds = [(axis, "<f4", "float") for axis in "xyz"] + [(name, "u1", "uchar") for name in ("red", "green", "blue")]
-    points = [(*(APPLIED[:, :3] @ point.xyz), *point.color) for point in model.points3D.values()]
-    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
-    head += [*(f"property {word} {name}" for name, _, word in kinds), "end_header", ""]
-    rows = np.array(points, dtype=[(name, kind) for name, kind, _ in kinds])
-    (out / CLOUD).write_bytes("\n".join(head).encode() + rows.tobytes())
+    points = np.array([(APPLIED[:, :3] @ point.xyz, point.color) for point in model.points3D.values()], "3<f4, 3u1")
+    columns = [f"property {x}" for x in ("float x", "float y", "float z", "uchar red", "uchar green", "uchar blue")]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *columns, "end_header", ""]
+    (out / CLOUD).write_bytes("\n".join(head).encode() + points.tobytes())
     write_text(out / TRANSFORMS, json.dumps(transforms_of(model, sources, masked=bool(masks)), indent=4) + "\n")
 
 

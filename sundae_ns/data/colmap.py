@@ -105,8 +105,8 @@ def read_points(model: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
                 end += 8 * _COUNT.unpack_from(content, end - _COUNT.size)[0]
             if end > len(content):
                 raise ValueError(f"it ends {end - len(content):,} bytes early")
-            crops = sliding_window_view(np.frombuffer(content + bytes(_POINT.itemsize), np.uint8), _POINT.itemsize)
-            points = crops[starts].view(_POINT)[:, 0]
+            windows = sliding_window_view(np.frombuffer(content + bytes(_POINT.itemsize), np.uint8), _POINT.itemsize)
+            points = windows[starts].view(_POINT)[:, 0]
             return points["xyz"].copy(), points["rgb"].copy()
     if (model / "points3D.txt").exists():
         with _content(model / "points3D.txt") as content:

@@ -70,9 +70,9 @@ def opened(path: Path) -> Image.Image:
                 image.seek(image.tell() + 1)
         image.info[_TURN] = image.getexif().pop(ExifTags.Base.Orientation, 1)  # else Pillow turns it as it is loaded
         image._size = getattr(image, "_tile_size", image.size)
-    elif image.format == "BMP" and (content := path.read_bytes())[70:74] == b"DEBM":  # a profile behind the pixels
-        start, size = np.frombuffer(content, "<u4", 2, 126).tolist()
-        image.info["icc_profile"] = content[14 + start :][:size]
+    elif image.format == "BMP" and bytes((mapped := np.memmap(path, mode="r"))[70:74]) == b"DEBM":
+        start, size = mapped[126:134].view("<u4").tolist()  # of a profile behind the pixels, which are not read for it
+        image.info["icc_profile"] = mapped[14 + start :][:size].tobytes()
     return image  # type: ignore[no-any-return]
 
 

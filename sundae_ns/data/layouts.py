@@ -153,4 +153,4 @@ def larger_model(data: Path, model: Path) -> str | None:
 def unused_masks(folder: Path) -> str | None:
     """Name of a folder of masks in a capture, if it has one with images."""
     kinds = {name: {path.suffix.lower() for path in entries(folder / name)} for name in ("masks", "mask")}
-    return next((name for name, found in kinds.items() if found & {".png", ".jpg", ".jpeg"}), None)
+    return next((name for name, suffixes in kinds.items() if suffixes & {".png", ".jpg", ".jpeg"}), None)

@@ -171,8 +171,8 @@ def masks_of(photos: Sequence[Photo], folder: Path) -> list[Path]:
     masks, root = list[Path](), Path(os.path.commonpath([photo.path.parent for photo in photos]))
     for path, _, wanted, _, _ in photos:
         names = (path.name, f"{path.name}.png", f"{path.stem}.png", f"{path.stem}.jpg")
-        places = folder / path.parent.relative_to(root), path.parent / folder.name, folder
-        if (mask := next((place / n for place in places for n in names if (place / n).is_file()), None)) is None:
+        folders = folder / path.parent.relative_to(root), path.parent / folder.name, folder
+        if (mask := next((beside / n for beside in folders for n in names if (beside / n).is_file()), None)) is None:
             raise DataError(f"{path} has no mask {path.stem}.png in {folder}; add it, white where pixels count")
         if mask in masks:
             raise DataError(f"{path} and another photo have one mask, {mask}; put masks into folders as the photos are")

@@ -23,7 +23,7 @@ from sundae_ns.core.errors import ConfigError, DataError, writing
 from sundae_ns.core.files import flush, write_text
 from sundae_ns.data.capture_files import TRANSFORMS, Advance, Placed, placed_in, write_capture, write_images
 from sundae_ns.data.layouts import LONGEST_SIDE
-from sundae_ns.data.photos import find_photos, masks_of
+from sundae_ns.data.photos import LEAST_PHOTOS, find_photos, masks_of
 from sundae_ns.data.video import is_video, write_frames
 from sundae_ns.io.run_folder import reserve
 
@@ -33,7 +33,6 @@ INSTALL = 'pip install "sundae_ns[photos]"'
 _MOST_EXHAUSTIVE = 200  # photos up to which all pairs are compared: 19,900 pairs
 _ALIKE = 40  # similar photos that each is compared with
 _PAIRS_AT_ONCE = 100  # per thread between two reports of progress
-_LEAST_MODEL = 3  # images of the smallest model that is kept
 
 
 class Request(NamedTuple):
@@ -162,7 +161,7 @@ def _pairs(work: Path, names: Sequence[str], matching: Matching, video: bool) ->
     with module.Database.open(work / "database.db") as database:
         stored = {image.image_id: image.name for image in database.read_all_images()}
         if matching == "exhaustive" or len(names) <= _ALIKE:
-            found = module.ExhaustivePairGenerator(module.ExhaustivePairingOptions(), database).all_pairs()
+            numbers = module.ExhaustivePairGenerator(module.ExhaustivePairingOptions(), database).all_pairs()
         else:
             overlap, alike, distance = (10, 5, 20) if matching == "sequential" else (3, _ALIKE, 0)
             options = module.SequentialPairingOptions()
@@ -171,11 +170,11 @@ def _pairs(work: Path, names: Sequence[str], matching: Matching, video: bool) ->
             options.loop_detection_num_images = alike + 1  # an image is most like itself
             options.loop_detection_min_index_distance = distance
             options.vocab_tree_path = _vocabulary(module, database, list(stored), work / "vocabulary.bin")
-            found = module.SequentialPairGenerator(options, database).all_pairs()
+            numbers = module.SequentialPairGenerator(options, database).all_pairs()
             if matching == "sequential":
                 options.quadratic_overlap, options.loop_detection = True, False
-                found += module.SequentialPairGenerator(options, database).all_pairs()
-        pairs = {(min(pair), max(pair)) for pair in found if pair[0] != pair[1]}
+                numbers += module.SequentialPairGenerator(options, database).all_pairs()
+        pairs = {(min(pair), max(pair)) for pair in numbers if pair[0] != pair[1]}
     # In blocks, whose features COLMAP loads once.
     return [(stored[a], stored[b]) for a, b in sorted(pairs, key=lambda pair: (pair[0] // 20, pair[1] // 20, pair))]
 
@@ -231,11 +230,12 @@ def _reconstruct(work: Path, images: Path, count: int, advance: Advance) -> list
         # COLMAP's own thresholds: weaker ones, and global mapping, join what only looks alike, with small errors.
         options = module.IncrementalPipelineOptions()
         # A fixed seed: the same photos give the same poses on the same machine.
-        options.num_threads, options.random_seed, options.min_model_size = threads(), 0, _LEAST_MODEL
+        options.num_threads, options.random_seed, options.min_model_size = threads(), 0, LEAST_PHOTOS
         callbacks = {"initial_image_pair_callback": lambda: advance(2), "next_image_callback": lambda: advance(1)}
         module.incremental_mapping(database, images, partial, options, **callbacks)
-        if (found := _models(partial)) and (not models or len(_posed(found[0])) > 1.1 * len(_posed(models[0]))):
-            models, best = found, partial
+        made = _models(partial)
+        if made and (not models or len(_posed(made[0])) > 1.1 * len(_posed(models[0]))):
+            models, best = made, partial
         if models and len(_posed(models[0])) >= 0.95 * count:
             break
     if not models:
@@ -254,7 +254,7 @@ def _models(folder: Path) -> list[Any]:
         for image in list(model.images.values()):
             if image.has_pose and image.num_points3D < 15:  # after the removal of outliers it may stand anywhere
                 model.deregister_frame(image.frame_id)
-        if len(_posed(model)) >= _LEAST_MODEL:
+        if len(_posed(model)) >= LEAST_PHOTOS:
             models.append(model)
     return sorted(models, key=lambda model: (-len(_posed(model)), float(model.compute_mean_reprojection_error())))
 
