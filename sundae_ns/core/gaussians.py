@@ -118,8 +118,8 @@ class Gaussians(UserDict[str, Any]):
 
     def rows(self, index: Tensor) -> Gaussians:
         """The Gaussians under a mask, bool ``[N]``, or of indices ``[M]``, in a new mapping."""
-        places = torch.arange(self.num_gaussians, device=self["means"].device)[index]  # a mask is searched once
-        return Gaussians({name: value.index_select(0, places) for name, value in self.items()}, self.encoding)
+        indices = torch.arange(self.num_gaussians, device=self["means"].device)[index]  # a mask is searched once
+        return Gaussians({name: value.index_select(0, indices) for name, value in self.items()}, self.encoding)
 
     def replaced(self, values: Mapping[str, Tensor]) -> Gaussians:
         """The same tensors except for these values, in a new mapping that surgery does not change."""

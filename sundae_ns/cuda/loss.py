@@ -21,8 +21,8 @@ SIGMA = 1.5  # Standard deviation of the window, pixels
 
 _TILE_WIDTH, _TILE_HEIGHT, _THREADS = 32, 16, 256
 
-_crop = [math.exp(-((k - SSIM_WINDOW // 2) ** 2) / (2 * SIGMA**2)) for k in range(SSIM_WINDOW)]
-_WEIGHTS = ",".join(f"{weight / sum(_crop):.9e}f" for weight in _crop)
+_window = [math.exp(-((k - SSIM_WINDOW // 2) ** 2) / (2 * SIGMA**2)) for k in range(SSIM_WINDOW)]
+_WEIGHTS = ",".join(f"{weight / sum(_window):.9e}f" for weight in _window)
 
 OPTIONS = (
     f"-DWINDOW={SSIM_WINDOW}",
@@ -66,11 +66,11 @@ class _Loss(torch.autograd.Function):
         image, target = image.contiguous(), target.contiguous()
         base = None if base is None else base.contiguous()
         height, width, channels = image.shape
-        crops = (height - SSIM_WINDOW + 1) * (width - SSIM_WINDOW + 1) * channels
-        derivatives = image.new_empty(3 * crops) if any(ctx.needs_input_grad) else None
+        windows = (height - SSIM_WINDOW + 1) * (width - SSIM_WINDOW + 1) * channels
+        derivatives = image.new_empty(3 * windows) if any(ctx.needs_input_grad) else None
         losses = image.new_empty(_threads(image) // _THREADS)
         base_losses = None if base is None else torch.empty_like(losses)
-        scales = (weights[0] / image.numel(), weights[1] / crops, 1 / image.numel())
+        scales = (weights[0] / image.numel(), weights[1] / windows, 1 / image.numel())
         arguments = [height, width, image, base, target, *scales, derivatives, losses, base_losses]
         loss_kernels(image.device)["compare"](_threads(image), arguments)
         ctx.save_for_backward(image, base, target, derivatives)

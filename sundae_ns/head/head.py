@@ -135,10 +135,10 @@ class CompensationHead(nn.Module):
         """
         parameters = list(self.parameters())
         self._build(config)
-        places = [(module, name) for module in self.net.modules() for name in module._parameters]
-        for own, (module, name) in zip(parameters, places, strict=True):
-            own.data, own.grad = getattr(module, name).data.to(own), None
-            setattr(module, name, own)
+        fresh = [(module, name) for module in self.net.modules() for name in module._parameters]
+        for parameter, (module, name) in zip(parameters, fresh, strict=True):
+            parameter.data, parameter.grad = getattr(module, name).data.to(parameter), None
+            setattr(module, name, parameter)
         self.net.train(self.training)
         self._weights = tuple(self.net.parameters())
 
@@ -174,12 +174,12 @@ def training_crop(width: int, height: int, max_pixels: int, seed: int, *, mirror
     because uniform ones would rarely include the pixels next to the edges. The window is a function of the seed, so
     that a resumed run uses the same windows; with ``mirror`` one of two is mirrored.
     """
-    whole = max_pixels == 0 or width * height <= max_pixels
-    if whole and not mirror:
+    fits = max_pixels == 0 or width * height <= max_pixels
+    if fits and not mirror:
         return None
     u, v, side = torch.rand(3, generator=torch.Generator().manual_seed(seed), dtype=torch.float32).tolist()
     mirrored = mirror and side < 0.5
-    if whole:
+    if fits:
         return Crop(0, 0, width, height, mirrored) if mirrored else None
     share = (max_pixels / (width * height)) ** 0.5
     columns, rows = (min(max(int(length * share) // GRID * GRID, GRID), length) for length in (width, height))

@@ -58,14 +58,14 @@ def rasterize_cameras(inputs: Inputs, viewmats: Tensor, Ks: Tensor, *, backend: 
     _check(singles[0])
     if isinstance(backend, GsplatBackend) and len(inputs.means):
         return backend.rasterize_cameras(inputs, viewmats, Ks)
-    images = each_view(backend.rasterize, singles, pairs=inputs.means.is_cpu and not torch.is_grad_enabled())
+    images = each_view(backend.rasterize, singles, two_at_once=inputs.means.is_cpu and not torch.is_grad_enabled())
     return torch.stack([image.colors for image in images])
 
 
-def each_view(function: Callable[[Any], T], views: Iterable[Any], *, pairs: bool) -> Iterator[T]:
-    """Results of a function for each view; with ``pairs`` two at a time: parts of a view take one core of a CPU."""
+def each_view(function: Callable[[Any], T], views: Iterable[Any], *, two_at_once: bool) -> Iterator[T]:
+    """Results of a function for each view; ``two_at_once`` on a CPU, where parts of a view take one core."""
     with ThreadPoolExecutor(2) as pool:
-        yield from (pool.map if pairs else map)(function, views)
+        yield from (pool.map if two_at_once else map)(function, views)
 
 
 def spherical_harmonics(degree: int, directions: Tensor, coeffs: Tensor, *, backend: Backend) -> Tensor:

@@ -195,36 +195,36 @@ def against_photos(data: Path | None) -> Callable[[Path], Subject]:
     return subject
 
 
-def against_first(path: Path, whole: Scene, cameras: Sequence[Camera]) -> Callable[[Path], Subject]:
-    """A function that opens scenes in views of the scene at a path, ``whole``, whose images are the truth."""
-    full, scaled, size = of_unit_size(whole, cameras)
-    views = [(camera, render(full, camera).rgb) for camera in scaled]
+def against_first(path: Path, reference: Scene, cameras: Sequence[Camera]) -> Callable[[Path], Subject]:
+    """A function that opens scenes in views of the scene at a path, ``reference``, whose images are the truth."""
+    unit, scaled, size = of_unit_size(reference, cameras)
+    views = [(camera, render(unit, camera).rgb) for camera in scaled]
 
     def subject(other: Path) -> Subject:
         if other == path:
-            return Subject.of_file(full, path, path.name, [])
-        scene = replace(aligned(load(other), whole), background_color=whole.background_color).to(full.device)
+            return Subject.of_file(unit, path, path.name, [])
+        scene = replace(aligned(load(other), reference), background_color=reference.background_color).to(unit.device)
         scene = replace(scene, gaussians=resized(scene.gaussians, 1 / size))
         return Subject.of_file(scene, other, path.name, views)
 
     return subject
 
 
-def cost_line(file: Path, source: Path, whole: Scene, name: str = "the whole scene", *, seed: int = 0) -> str:
-    """What a file costs: its bytes of those of its source, and its images against those of the ``whole`` scene.
+def cost_line(file: Path, source: Path, reference: Scene, name: str = "the whole scene", *, seed: int = 0) -> str:
+    """What a file costs: its bytes of those of its source, and its images against those of the ``reference`` scene.
 
     At most 16 of the scene's cameras see both; without any, virtual ones that no prune of the ``seed`` sees.
     """
-    given, views = whole.cameras, held_out_cameras(whole, whole.cameras, seed=seed)
-    opened = against_first(source, whole, views)
+    given, views = reference.cameras, held_out_cameras(reference, reference.cameras, seed=seed)
+    opened = against_first(source, reference, views)
     before, after = (measure(opened(path), repeats=0) for path in (source, file))
     values = [min(view.psnr, MOST_PSNR) for view in after.full.views]
     by = f"{len(views)}{f' of {len(given)}' if len(given) > len(views) else ''} {'' if given else 'held-out '}cameras"
     if given and views[0][2:] != given[0][2:]:
         by += f" at {views[0].width} x {views[0].height} px"
     sizes = f"{number(after.full.bytes / MEGABYTE, 2)} MB (of {number(before.full.bytes / MEGABYTE, 2)})"
-    figures = f"{fmean(values):.1f} dB, {number(after.full.mean('ssim'), 3)} against {name} on {by}"
-    return f"{sizes}; {figures}, worst {min(values):.1f}"
+    ssim = number(after.full.mean("ssim"), 3)
+    return f"{sizes}; {fmean(values):.1f} dB, {ssim} against {name} on {by}, worst {min(values):.1f}"
 
 
 def labels_of(paths: Sequence[Path]) -> list[str]:

@@ -66,8 +66,8 @@ def choose_cameras(qualities: Sequence[float], most: int) -> list[int]:
     NaN counts as worst.
     """
     ranked = sorted(range(len(qualities)), key=lambda i: -math.inf if math.isnan(qualities[i]) else qualities[i])
-    places = np.linspace(0, len(ranked) - 1, min(len(ranked), max(most, 2))).round()
-    return sorted(ranked[int(place)] for place in places)
+    ranks = np.linspace(0, len(ranked) - 1, min(len(ranked), max(most, 2))).round()
+    return sorted(ranked[int(rank)] for rank in ranks)
 
 
 def error_map(rendering: Tensor, truth: Tensor, size: tuple[int, int] | None = None) -> Image.Image:

@@ -233,7 +233,7 @@ def contribution(
         image = None if images is None else torch.cat([splatted.colors.detach(), splatted.alpha.detach()], dim=2).half()
         return rows, torch.autograd.grad(blended, colors)[0][:, 0], image
 
-    views = each_view(of_view, cameras, pairs=total.is_cpu)
+    views = each_view(of_view, cameras, two_at_once=total.is_cpu)
     for rows, new, image in track(views, label, len(cameras), transient=True, console=console, disable=not console):
         total[rows] += new
         if images is not None and count is not None:  # only a pass that weights by detail renders the image

@@ -41,7 +41,7 @@ from sundae_ns.rasterize.reference import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANC
 
 _PIXELS = TILE * TILE
 _CHECK_EVERY = 8  # list entries between two checks for opaque tiles
-_AT_HAND = 16  # list entries whose numbers are read together
+_GATHERED = 16  # list entries whose numbers are read together
 _COLORS = OPACITY + 1  # first column of the colours among these numbers
 _FAINTEST = 20.0  # upper bound of negated exponents, far beyond log(255)
 _MIN_TILES = 8  # tiles that are worth another thread
@@ -120,7 +120,7 @@ def _blend(
     down = (np.arange(_PIXELS) // TILE + 0.5).astype(table.dtype)
     # Pixels are the fastest axis within a group of WIDTH, then channels.
     summed, blended = np.empty(_PIXELS, table.dtype), np.empty((_PIXELS // WIDTH, channels, WIDTH), table.dtype)
-    gathered = np.empty((_AT_HAND, _COLORS + channels), table.dtype)
+    gathered = np.empty((_GATHERED, _COLORS + channels), table.dtype)
     for k in range(begin, end):
         tile = tiles[k]
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
@@ -134,12 +134,12 @@ def _blend(
         blended[:] = 0
         start = starts[tile]
         for entry in range(start, starts[tile + 1]):
-            at_hand = (entry - start) % _AT_HAND
-            if at_hand == 0:
+            gathered_at = (entry - start) % _GATHERED
+            if gathered_at == 0:
                 _gather(ranks, entry, starts[tile + 1], table, ids, colors, gathered)
-            row = gathered[at_hand]
+            row = gathered[gathered_at]
             dx, v = x - (row[U] - number(left)), row[V] - number(top)
-            place = entry - start + 1
+            nth = entry - start + 1
             for step in range(spans[entry, 0], spans[entry, 1]):
                 p = step * WIDTH
                 alphas = minimum(_unclamped_alphas(dx, load(down, p) - v, row), MAX_ALPHA)
@@ -149,12 +149,12 @@ def _blend(
                 blends = visible & (behind > MIN_TRANSMITTANCE)
                 store(through, p, select(blends, behind, select(visible, 0.0 - absolute(before), before)))
                 weights = select(blends, alphas * before, 0.0)
-                store(blended_last, p, select(blends, place, load(blended_last, p)))
+                store(blended_last, p, select(blends, nth, load(blended_last, p)))
                 store(summed, p, load(summed, p) + weights)
                 for c in range(channels):
                     at = p * channels + c * WIDTH
                     store(blended, at, fma(weights, broadcast(row, _COLORS + c), load(blended, at)))
-            if place % _CHECK_EVERY == 0 and not _any_unfinished(through):
+            if nth % _CHECK_EVERY == 0 and not _any_unfinished(through):
                 break
         through[:] = np.abs(through)
         for y in range(min(TILE, height - top)):
@@ -198,7 +198,7 @@ def _blend_backward(begin: int, end: int, lists: Any, blended: Any, gradients: A
     through, behind = np.empty(_PIXELS, table.dtype), np.empty(_PIXELS, table.dtype)
     weights, grads = np.empty(_PIXELS, table.dtype), np.zeros((_PIXELS // WIDTH, padded, WIDTH), table.dtype)
     alpha_grads = np.zeros(_PIXELS, table.dtype)
-    gathered = np.empty((_AT_HAND, _COLORS + channels), table.dtype)
+    gathered = np.empty((_GATHERED, _COLORS + channels), table.dtype)
     for k in range(begin, end):
         tile = tiles[k]
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
@@ -214,12 +214,12 @@ def _blend_backward(begin: int, end: int, lists: Any, blended: Any, gradients: A
                 alpha_grads[p] = grad_alpha[top + y, left + x_of_pixel, 0]
         start, deepest = starts[tile], int(blended_last.max())
         parts[start + deepest : starts[tile + 1]] = 0
-        for place in range(deepest, 0, -1):
-            entry = start + place - 1
-            at_hand = (place - 1) % _AT_HAND
-            if place == deepest or at_hand == _AT_HAND - 1:
-                _gather(ranks, entry - at_hand, entry + 1, table, ids, colors, gathered)
-            row = gathered[at_hand]
+        for nth in range(deepest, 0, -1):
+            entry = start + nth - 1
+            gathered_at = (nth - 1) % _GATHERED
+            if nth == deepest or gathered_at == _GATHERED - 1:
+                _gather(ranks, entry - gathered_at, entry + 1, table, ids, colors, gathered)
+            row = gathered[gathered_at]
             dx, v = x - (row[U] - number(left)), row[V] - number(top)
             m = mx = my = mxx = mxy = myy = absolute_x = absolute_y = none
             for step in range(spans[entry, 0], spans[entry, 1]):
@@ -227,7 +227,7 @@ def _blend_backward(begin: int, end: int, lists: Any, blended: Any, gradients: A
                 dy = load(down, p) - v
                 unclamped = _unclamped_alphas(dx, dy, row)
                 alphas = minimum(unclamped, MAX_ALPHA)
-                blends = (alphas >= MIN_ALPHA) & (load(blended_last, p) >= place)
+                blends = (alphas >= MIN_ALPHA) & (load(blended_last, p) >= nth)
                 inverse = 1.0 / (1.0 - alphas)
                 before = load(through, p) * inverse
                 weight = select(blends, alphas * before, 0.0)
@@ -284,7 +284,7 @@ def _sum_channels(weights: Any, grads: Any, first: int, beyond: int, channel: in
 @compiled
 def _sum_slots(begin: int, end: int, lists: Any, parts: Any, padded: int, outputs: Any, absolute_grads: Any) -> None:
     """Sum the slots of each Gaussian in float64, convert moments to gradients, and add them to the outputs."""
-    _, _, _, _, places, _, ids, first_slots, table = lists
+    _, _, _, _, entries, _, ids, first_slots, table = lists
     grad_means2d, grad_conics, grad_opacities, grad_colors = outputs
     width = parts.shape[1]
     sums = np.empty(width)
@@ -293,7 +293,7 @@ def _sum_slots(begin: int, end: int, lists: Any, parts: Any, padded: int, output
         sums[:] = 0
         for slot in range(first_slots[rank], first_slots[rank + 1]):
             for d in range(width):
-                sums[d] += parts[places[slot], d]
+                sums[d] += parts[entries[slot], d]
         for c in range(grad_colors.shape[1]):
             grad_colors[i, c] += sums[c]
         if width == padded:  # only the colours have gradients

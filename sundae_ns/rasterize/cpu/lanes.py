@@ -155,15 +155,15 @@ def _call(builder: Any, name: str, *lanes: Any) -> Any:
     return builder.call(cgutils.get_or_insert_function(builder.module, signature, f"llvm.{name}.{suffix}"), lanes)
 
 
-def _address(context: Any, builder: Any, kind: Any, array: Any, place: Any) -> Any:
+def _address(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
     """Address of an element of a C-contiguous array, as a pointer to lanes."""
     data = arrayobj.make_array(kind)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [place]), context.get_value_type(Lanes(kind.dtype)).as_pointer())
+    return builder.bitcast(builder.gep(data, [index]), context.get_value_type(Lanes(kind.dtype)).as_pointer())
 
 
 @_intrinsic
-def load(typing: Any, array: Any, place: Any) -> Any:
-    """Load the lanes of a C-contiguous array, from flat index ``place`` on. Bounds are not checked."""
+def load(typing: Any, array: Any, index: Any) -> Any:
+    """Load the lanes of a C-contiguous array, from flat ``index`` on. Bounds are not checked."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.load(_address(context, builder, array, *arguments), align=array.dtype.bitwidth // 8)
@@ -172,8 +172,8 @@ def load(typing: Any, array: Any, place: Any) -> Any:
 
 
 @_intrinsic
-def broadcast(typing: Any, array: Any, place: Any) -> Any:
-    """Load one element of a C-contiguous array, at flat index ``place``, into all lanes."""
+def broadcast(typing: Any, array: Any, index: Any) -> Any:
+    """Load one element of a C-contiguous array, at flat ``index``, into all lanes."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         data = arrayobj.make_array(array)(context, builder, arguments[0]).data
@@ -184,7 +184,7 @@ def broadcast(typing: Any, array: Any, place: Any) -> Any:
 
 
 @_intrinsic
-def store(typing: Any, array: Any, place: Any, values: Any) -> Any:
+def store(typing: Any, array: Any, index: Any, values: Any) -> Any:
     """Store lanes where :func:`load` would read them; a scalar is stored in all."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -207,7 +207,7 @@ def zeros(typing: Any, array: Any) -> Any:
 
 
 @_intrinsic
-def store_sums(typing: Any, array: Any, place: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
+def store_sums(typing: Any, array: Any, index: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
     """Store four sums over lanes side by side; each adds its halves first, then neighbours, pairs, quadruples."""
     rows = (a, b, c, d)
 
@@ -219,7 +219,7 @@ def store_sums(typing: Any, array: Any, place: Any, a: Any, b: Any, c: Any, d: A
         for size in (1, 2):
             # Interleave blocks of `size` numbers of two rows.
             first = [row * 8 + block + i for block in range(0, 8, 2 * size) for row in (0, 1) for i in range(size)]
-            second = [place + size for place in first]
+            second = [lane + size for lane in first]
             sums = [
                 builder.fadd(_shuffled(builder, a, b, first), _shuffled(builder, a, b, second))
                 for a, b in zip(sums[::2], sums[1::2])

@@ -44,7 +44,7 @@ class Lists(NamedTuple):
     longest_first: Any  # [B], int32: tiles with a list, the longest first
     starts: Any  # [T + 1], int64: start of each tile's list
     ranks: Any  # [L], int32, in list order
-    places: Any  # [L], int32, in the order of the slots: places in the lists
+    entries: Any  # [L], int32, in the order of the slots: where each stands in the lists
     spans: Any  # [L, 2], uint8, in list order: the steps of a tile that are touched, the last excluded
     ids: Any  # [V], int32: Gaussian of each rank
     first_slots: Any  # [V + 1], int64: first slot of each rank
@@ -86,10 +86,10 @@ def tile_lists(projection: Projection, opacities: Tensor, width: int, height: in
             regions += halves
             continue
         listed += pairs
-        starts, ranks, places, spans = _sort_by_tile(boxes, first_intervals, intervals, first_slots, columns, rows)
+        starts, ranks, entries, spans = _sort_by_tile(boxes, first_intervals, intervals, first_slots, columns, rows)
         lengths = np.diff(starts)
         longest_first = np.argsort(-lengths, kind="stable").astype(np.int32)[: np.count_nonzero(lengths)]
-        yield Lists(columns, longest_first, starts, ranks, places, spans, ids, first_slots, table)
+        yield Lists(columns, longest_first, starts, ranks, entries, spans, ids, first_slots, table)
 
 
 def _halves(left: int, top: int, right: int, bottom: int) -> list[tuple[int, int, int, int]]:
@@ -123,9 +123,9 @@ def _visible_by_depth(keys: Any, radii: Any, opacities: Any) -> Any:
             ends[digit] = total
             total += size
         for i in ids:
-            place = (np.int64(keys[i]) >> shift) & ((1 << _DIGIT_BITS) - 1)
-            other[ends[place]] = i
-            ends[place] += 1
+            bucket = (np.int64(keys[i]) >> shift) & ((1 << _DIGIT_BITS) - 1)
+            other[ends[bucket]] = i
+            ends[bucket] += 1
         ids, other = other, ids
     return ids
 
@@ -220,7 +220,7 @@ def _sort_by_tile(
     for tile in range(columns * rows):
         starts[tile + 1] += starts[tile]
     count = first_slots[-1]
-    ranks, places, spans = np.empty(count, np.int32), np.empty(count, np.int32), np.empty((count, 2), np.uint8)
+    ranks, entries, spans = np.empty(count, np.int32), np.empty(count, np.int32), np.empty((count, 2), np.uint8)
     ends: Any = starts.copy()
     slot = 0
     for rank in range(len(first_intervals) - 1):
@@ -230,11 +230,11 @@ def _sort_by_tile(
             row = first // TILE
             for _ in range(_num_tiles(first, beyond)):
                 tile = row * columns + column
-                place = ends[tile]
-                ranks[place], places[slot] = rank, place
-                spans[place, 0] = max(first - row * TILE, 0) // STEP
-                spans[place, 1] = (min(beyond - row * TILE, TILE) + STEP - 1) // STEP
+                entry = ends[tile]
+                ranks[entry], entries[slot] = rank, entry
+                spans[entry, 0] = max(first - row * TILE, 0) // STEP
+                spans[entry, 1] = (min(beyond - row * TILE, TILE) + STEP - 1) // STEP
                 ends[tile] += 1
                 slot += 1
                 row += 1
-    return starts, ranks, places, spans
+    return starts, ranks, entries, spans
