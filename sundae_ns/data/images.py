@@ -64,6 +64,8 @@ def opened(path: Path) -> Image.Image:
         image, end = Image.open(BytesIO(content)), max(content.find(b"IDAT"), 0)
         if (at := content.find(b"\0\0\0\4cICP", 0, end)) >= 0:
             image.info["cicp"] = content[at + 8 : at + 12]
+    elif "progressive" in image.info and (scans := path.read_bytes().count(b"\xff\xda")) > 200:  # each takes its time
+        raise ValueError(f"it has {scans:,} scans")
     elif image.format == "TIFF":
         with suppress(EOFError):
             while image.tag_v2.get(254, 0) & 1 and image.tell() < 8:  # a thumbnail in front of the photo
@@ -123,8 +125,7 @@ def to_srgb(image: Image.Image) -> Image.Image:
 
 def is_srgb(image: Image.Image) -> bool:
     """Whether the pixels are of type L, RGB or RGBA, and in sRGB."""
-    plain = image.mode in ("L", "RGB", "RGBA") and "transparency" not in image.info
-    return plain and _conversion(image) is None
+    return image.mode in ("L", "RGB", "RGBA") and "transparency" not in image.info and _conversion(image) is None
 
 
 def _conversion(image: Image.Image) -> Callable[[Image.Image], Any] | None:
@@ -182,8 +183,7 @@ def to_srgb_values(values: NDArray[Any], transfer: float, primaries: Any) -> NDA
     if not isinstance(primaries, tuple):
         primaries = _PRIMARIES.get(primaries, _PRIMARIES[9] if transfer in HIGH_RANGE else _SRGB)
     if transfer == HLG:
-        luminance = light @ np.array([0.2627, 0.6780, 0.0593], np.float32)
-        light *= 1000 / _WHITE * luminance[..., None] ** np.float32(0.2)
+        light *= 1000 / _WHITE * (light @ np.array([0.2627, 0.6780, 0.0593], np.float32))[..., None] ** np.float32(0.2)
     light = light @ np.linalg.solve(_to_xyz(_SRGB), _to_xyz(primaries)).T.astype(np.float32)
     if transfer in HIGH_RANGE:
         brightest = light.max(axis=-1, keepdims=True).clip(1e-6)

@@ -9,7 +9,7 @@ from typing import IO, Any
 from sundae_ns.core.gaussians import sh_degree_of
 
 SPARE, RATIO = 64 << 20, 32  # bytes, and bytes for each byte of the file; a real .sog has 24, a .spz 12
-_MOST_JSON = 16 << 20
+_MOST_JSON = 8 << 20
 
 
 def afford(unpacked: int, size: int, spare: int = SPARE, ratio: int = RATIO) -> None:
@@ -33,7 +33,7 @@ def read_exactly(stream: IO[bytes] | BufferedIOBase, size: int) -> bytes:
 
 
 def parsed_json(content: bytes) -> Any:
-    """A JSON object of a file; ``ValueError`` for other values, and for more than 16 MiB, which take a gigabyte."""
+    """A JSON object of a file; ``ValueError`` for other values, and for more than 8 MiB, which take 200."""
     if len(content) > _MOST_JSON:
         raise ValueError(f"its JSON has {len(content):,} bytes, and may have {_MOST_JSON:,}")
     if not isinstance(value := json.loads(content), dict):

@@ -267,6 +267,8 @@ def load_tensors(file: BinaryIO) -> Any:
 
 
 def _check_pickle(pickled: bytes) -> None:
+    if len(pickled) > 1 << 21:  # a second's work; real ones are much smaller, as tensors lie beside them
+        raise ValueError(f"its structure has {len(pickled):,} bytes")
     ranks: dict[Any, int] = {}  # nesting depth of each tuple, by its index in the pickle's memo
     rank, is_tuple = 0, False
     for operation, argument, _ in pickletools.genops(pickled):

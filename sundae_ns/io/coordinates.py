@@ -152,5 +152,4 @@ def scene_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
         spread = np.abs(centred).mean() or 1.0
     bent = np.arcsinh(centred / spread)
     low, extent = bent.min(axis=0), np.ptp(bent, axis=0).max() or 1.0
-    cells = ((bent - low) / extent * (2**MAX_BITS - 1)).astype(np.uint64)
-    return np.argsort(interleave(cells), kind="stable")
+    return np.argsort(interleave(((bent - low) / extent * (2**MAX_BITS - 1)).astype(np.uint64)), kind="stable")

@@ -266,8 +266,7 @@ def _placed(gaussians: Mapping[str, Tensor], transforms: Transforms) -> dict[str
     placed = {**gaussians, "means": gaussians["means"].double()}
     if np.array_equal(transforms, np.eye(4)[None]):
         return placed
-    linear = transforms[:, :3, :3]
-    factor = np.cbrt(np.abs(np.linalg.det(linear)))[:, None, None]
+    factor = np.cbrt(np.abs(np.linalg.det(transforms[:, :3, :3])))[:, None, None]
     rigid = transforms[:, :3] / np.where(factor > 0, factor, np.nan)
     if not np.allclose(rigid[..., :3] @ rigid[..., :3].transpose(0, 2, 1), np.eye(3), rtol=0, atol=1e-4):
         raise ValueError("a node stretches its Gaussians")

@@ -222,6 +222,5 @@ def test_masks_are_black_and_white(tmp_path, name, white):
 
 
 def test_srgb_stays_as_it_is(tmp_path):
-    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
-    patches().save(tmp_path / "a.jpg", icc_profile=srgb)
+    patches().save(tmp_path / "a.jpg", icc_profile=ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
     assert photo_of(tmp_path / "a.jpg").as_it_is

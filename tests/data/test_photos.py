@@ -66,6 +66,13 @@ def zipped_text(path):
     path.write_bytes(content[:-12] + chunk + content[-12:])
 
 
+def scans(path):
+    """A progressive JPEG whose last scan comes often: each is decoded over the whole image."""
+    Image.new("RGB", (16, 12)).save(path, "JPEG", progressive=True)
+    content = path.read_bytes()
+    path.write_bytes(content[:-2] + 300 * content[content.rfind(b"\xff\xda") : -2])
+
+
 SPHERE = b'<rdf:Description GPano:ProjectionType="equirectangular"/>'
 CYLINDER = SPHERE.replace(b"equirectangular", b"cylindrical")
 ODD = {
@@ -83,6 +90,7 @@ ODD = {
     "a panorama": (lambda path: Image.new("RGB", (32, 16)).save(path, "WEBP", xmp=SPHERE), "are panoramas: cut"),
     "a cylinder": (lambda path: Image.new("RGB", (32, 16)).save(path, "WEBP", xmp=CYLINDER), "a panorama: leave it"),
     "a panorama of an iPhone": (lambda path: photo(path, panorama=True), "a panorama: leave it"),
+    "a scan 300 times": (scans, r"it has 3\d\d scans"),
     "a line": (lambda path: photo(path, size=(8000, 2)), "8000 x 2 px, too narrow for camera poses"),
     "a column": (lambda path: photo(path, size=(20, 8000)), "20 x 8000 px, too narrow for camera poses"),
 }

@@ -166,6 +166,7 @@ def _key(levels):
 
 WRONG = {
     "tuples that hold each other": (_pickled(_key(60)), "tuples in tuples"),
+    "a long structure": (_pickled(b"]q\0(", 1_100_000 * b"h\0", b"e"), "structure has 2,200,008 bytes"),
     "lists that hold themselves": (_laugh, "holds no Gaussians"),
     "four gigabytes of bytes": (_pickled(_call(b"builtins\nbytearray", _GIGABYTES)), "more than tensors .*bytearray"),
     "four gigabytes of numbers": (_pickled(_call(b"torch\nFloatTensor", _GIGABYTES)), "more than .*FloatTensor"),

@@ -39,8 +39,7 @@ def gaussians():
 
 
 def gaussians_of(values, start=0, end=N):
-    rows = ParameterDict({name: Parameter(value[start:end].clone()) for name, value in values.items()})
-    return Gaussians(rows)
+    return Gaussians(ParameterDict({name: Parameter(value[start:end].clone()) for name, value in values.items()}))
 
 
 def camera(rank, *, behind=False):

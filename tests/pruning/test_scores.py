@@ -25,8 +25,7 @@ def test_attribute_response_finds_the_colour_edge():
     params = gaussians(n)
     grid = torch.arange(20.0)
     params["means"] = torch.cartesian_prod(grid, grid, torch.zeros(1))
-    left = params["means"][:, 0] < 10
-    params["features_dc"] = rgb_to_sh(torch.where(left, 0.2, 0.8)[:, None].expand(-1, 3)).clone()
+    params["features_dc"] = rgb_to_sh(torch.where(params["means"][:, 0] < 10, 0.2, 0.8)[:, None].expand(-1, 3)).clone()
     params["scales"] = torch.zeros(n, 3)
     params["opacities"] = torch.zeros(n, 1)
     magnitude = response(params, PruneRule(num_neighbors=8, edges="centres"))

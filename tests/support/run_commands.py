@@ -79,8 +79,7 @@ class Commands:
             for one in names[: self.placed]:
                 photo(capture / "images" / one)
             frames = [{"file_path": f"images/{one}", "original": one} for one in names[: self.placed]]
-            meta = {"frames": frames, "left_out": names[self.placed :]}
-            (capture / "transforms.json").write_text(json.dumps(meta))
+            (capture / "transforms.json").write_text(json.dumps({"frames": frames, "left_out": names[self.placed :]}))
         elif name == "sundae pack":
             Path(self.option("-o")).write_bytes(packed())
         elif name == "sundae export":

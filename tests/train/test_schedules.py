@@ -95,8 +95,7 @@ def test_options_set_by_hand_keep_their_value():
 @pytest.mark.parametrize("length", [300, 1500, 7000, 50000])
 def test_continuous_pruning_keeps_its_number_of_prunes(length):
     def prunes(config):
-        pruning = config.pipeline.model.pruning
-        return sum(pruning.due(UNPRUNED, step, 1000) for step in range(config.max_num_iterations))
+        return sum(config.pipeline.model.pruning.due(UNPRUNED, step, 1000) for step in range(config.max_num_iterations))
 
     assert prunes(fitted("sundae-continuous", length)) == prunes(fitted("sundae-continuous", 30000)) == 7
 
@@ -299,8 +298,7 @@ def test_weights_of_many_inputs_have_smaller_rates():
     rates = {value: group["lr"] for group in optimizer.param_groups for value in group["params"]}
     assert len(rates) == len(list(head.parameters()))
     for conv in (module for module in head.modules() if isinstance(module, torch.nn.Conv2d)):
-        inputs = conv.in_channels * conv.kernel_size[0] ** 2
-        assert rates[conv.weight] == pytest.approx(1e-3 * min(1, 1152 / inputs))
+        assert rates[conv.weight] == pytest.approx(1e-3 * min(1, 1152 / (conv.in_channels * conv.kernel_size[0] ** 2)))
         assert rates[conv.bias] == 1e-3
     assert min(rates.values()) == pytest.approx(1e-3 / 6)  # 3 x 3 of 512 + 256 channels
 
