@@ -15,7 +15,7 @@ from sundae_ns.cli.refusals import check_exclusive, check_file, check_least, che
 from sundae_ns.core.errors import ConfigError
 from sundae_ns.pruning.rule import PruneRule, ScoreName
 from sundae_ns.rasterize.interface import fastest_device
-from sundae_ns.scene.compose import OTHERS
+from sundae_ns.scene.compose import LEAST_SEEN, OTHERS
 from sundae_ns.scene.load_save import SUFFIXES, save
 
 
@@ -82,9 +82,9 @@ def prune(
         left = before.reduced(out, rule=advanced.rule, num_cameras=advanced.num_cameras, target_drop=target_drop)
         left.write(out)
         print(f"{out}: {left.scene.num_gaussians:,} of {len(left.rows):,} Gaussians")
-        if left.pruned is not None and left.pruned.seen is not None:
-            what = f"; {OTHERS}" if before.cameras and left.pruned.seen < 0.92 else ""
-            print(f"{len(left.cameras)} cameras see {left.pruned.seen:.1%} of the Gaussians{what}")
+        if left.pruned is not None and left.pruned.seen_share is not None:
+            what = f"; {OTHERS}" if before.cameras and left.pruned.seen_share < LEAST_SEEN else ""
+            print(f"{len(left.cameras)} cameras see {left.pruned.seen_share:.1%} of the Gaussians{what}")
     before.print_cost(out)
     return 0
 

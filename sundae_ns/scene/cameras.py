@@ -24,6 +24,8 @@ from sundae_ns.scene.virtual_cameras import FOV, front_views
 
 MOST_FRAMES = 36_000  # of a film: 25 minutes
 MOST_CAMERAS = 10_000  # of a file
+_STEEP = 0.95  # largest sine of a camera's pitch; steeper ones have no upright image
+Array = NDArray[np.float64]
 Pinhole = tuple[np.ndarray, Sequence[float], int, int]  # OpenGL camera-to-world [3 or 4, 4], fx fy cx cy, width, height
 
 
@@ -148,10 +150,6 @@ def with_start(scene: Scene, start_view: str | None, up: Sequence[float] | None)
         stored = f"--start-view 0 to {len(scene.cameras) - 1}, or a camera file" if scene.cameras else "a camera file"
         raise ConfigError(f"there is no camera {start_view} in the scene; give {stored}")
     return dataclasses.replace(scene, start=scene.cameras[int(start_view)])
-
-
-_STEEP = 0.95  # largest sine of a camera's pitch; steeper ones have no upright image
-Array = NDArray[np.float64]
 
 
 def film_views(scene: Scene, *, seconds: float = 12.0, frames_per_second: float = 24.0) -> list[Camera]:

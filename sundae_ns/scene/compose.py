@@ -24,6 +24,7 @@ from sundae_ns.scene.prune_scene import weights_in
 from sundae_ns.scene.scene import Scene, unit, usable_cameras, within
 
 HARDLY_SEEN = 0.17  # share below 1% of the mean weight: up to 0.10 in the captures tried, elsewhere from 0.27 on
+LEAST_SEEN = 0.92  # share of the Gaussians that the cameras of a prune see, else they may be in other coordinates
 OTHERS = "if the cameras are not in the coordinates of the scene, give those of its own run or capture"
 _log = logging.getLogger(__name__)
 
@@ -57,29 +58,29 @@ def transform(
         raise ConfigError(f"scale is {scale}; give a positive number")
     shift, meta = numbers(translation, "translation", (3,)), dict(scene.meta)
     if scene.offset is not None:
-        offset = torch.tensor(scene.offset, dtype=torch.float64)
         # What is near the origin stays there, for the digits of float32.
-        offset, shift = scale * turn @ offset + shift, torch.zeros(3, dtype=torch.float64)
+        offset = scale * turn @ torch.tensor(scene.offset, dtype=torch.float64) + shift
+        shift = torch.zeros(3, dtype=torch.float64)
         meta["frame"] = {"transform": torch.cat([torch.eye(3), -offset[:, None]], dim=1).tolist(), "scale": 1.0}
     elif "frame" in meta:
         stated = torch.tensor(meta["frame"]["transform"], dtype=torch.float64)[:3]
         size = scale * meta["frame"]["scale"]
         stated = torch.cat([turn @ stated[:, :3], turn @ stated[:, 3:] + shift[:, None] / size], dim=1)
         meta["frame"] = {"transform": stated.tolist(), "scale": size}
-    placed = torch.cat([turn, shift[:, None] / scale], dim=1)
-    moved = similarity({**scene.gaussians, "means": scene.means.double()}, placed, float(scale))
+    rigid = torch.cat([turn, shift[:, None] / scale], dim=1)
+    moved = similarity({**scene.gaussians, "means": scene.means.double()}, rigid, float(scale))
     moved["means"] = positions(moved["means"], "the moved scene").to(scene.means)
-    inverse = torch.cat([scale * placed, torch.eye(4, dtype=torch.float64)[3:]]).inverse()
+    inverse = torch.cat([scale * rigid, torch.eye(4, dtype=torch.float64)[3:]]).inverse()
     sizes = torch.tensor([[scale]] * 3 + [[1.0]], dtype=torch.float64)  # of what a camera sees
 
-    def seen(camera: Camera) -> Camera:
+    def moved_camera(camera: Camera) -> Camera:
         return camera._replace(viewmat=(sizes * camera.viewmat.double() @ inverse).to(camera.viewmat))
 
     return dataclasses.replace(
         scene,
         gaussians=scene.gaussians.replaced(moved),
-        cameras=tuple(map(seen, scene.cameras)),
-        start=scene.start and seen(scene.start),
+        cameras=tuple(map(moved_camera, scene.cameras)),
+        start=scene.start and moved_camera(scene.start),
         up=scene.up and unit(turn @ numbers(scene.up, "up", (3,))),
         in_model_frame=False,
         meta=meta,
@@ -103,25 +104,25 @@ def merge(scenes: Iterable[Scene]) -> Scene:
     """
     if not (scenes := list(scenes)) or not all(isinstance(scene, Scene) for scene in scenes):
         raise DataError("merge found no scenes; give a list of them")
-    first, encodings = scenes[0], {scene.gaussians.encoding for scene in scenes}
+    first = scenes[0]
     if not all(_same(first.head, scene.head) for scene in scenes):
         raise DataError("one head cannot correct scenes of others; give dataclasses.replace(scene, head=None) of each")
     if len({scene.antialiased for scene in scenes}) > 1:
         raise DataError("opacities of antialiased scenes mean less than those of others; train or export all alike")
     if len({scene.offset is None for scene in scenes}) > 1:
         raise DataError("some scenes have survey coordinates and others not; give dataclasses.replace(scene, meta={})")
-    degree, joined = max(scene.gaussians.sh_degree for scene in scenes), []
-    for scene in scenes:
-        scene = aligned(scene, first)
-        gaussians = (scene.gaussians if len(encodings) == 1 else scene.gaussians.as_harmonics()).to(first.device)
-        missing = (0, 0, 0, (degree + 1) ** 2 - 1 - gaussians["features_rest"].shape[1])
-        joined.append((gaussians.replaced({"features_rest": pad(gaussians["features_rest"], missing)}), scene.cameras))
+    scenes = [aligned(scene, first) for scene in scenes]
+    alike = len({scene.gaussians.encoding for scene in scenes}) == 1
+    parts = [(scene.gaussians if alike else scene.gaussians.as_harmonics()).to(first.device) for scene in scenes]
+    most = max(part["features_rest"].shape[1] for part in parts)
     names = [name for name in first.gaussians if name != FEATURES or first.head is not None]
-    params = {name: torch.cat([gaussians[name] for gaussians, _ in joined]) for name in names}
+    rest = [pad(part["features_rest"], (0, 0, 0, most - part["features_rest"].shape[1])) for part in parts]
+    parts = [part.replaced({"features_rest": value}) for part, value in zip(parts, rest, strict=True)]
+    params = {name: torch.cat([part[name] for part in parts]) for name in names}
     return dataclasses.replace(
         first,
-        gaussians=Gaussians(params, joined[0][0].encoding),
-        cameras=tuple(dict.fromkeys(camera for _, cameras in joined for camera in cameras)),  # parts share theirs
+        gaussians=Gaussians(params, parts[0].encoding),
+        cameras=tuple(dict.fromkeys(camera for scene in scenes for camera in scene.cameras)),  # parts share theirs
         up=first.up or next((scene.up for scene in scenes if scene.up), None),
     )
 
@@ -191,7 +192,8 @@ def crop_mask(scene: Scene, low: AnyArray, high: AnyArray) -> Tensor:
         raise ConfigError("the box is empty; give its lowest x y z first, then its highest")
     inside = ((means >= lowest) & (means <= highest)).all(dim=1)
     if not bool(inside.any()):
-        digits, ends = 3 if scene.offset is None else 10, np.quantile(means.cpu().numpy(), (0.05, 0.95), axis=0)
+        digits = 3 if scene.offset is None else 10
+        ends = np.quantile(means.cpu().numpy(), (0.05, 0.95), axis=0)
         corners = (" ".join(f"{value:.{digits}g}" for value in corner) for corner in ends)
         raise DataError(f"no Gaussian is in the box; most of them lie between {' and '.join(corners)}")
     return inside

@@ -123,17 +123,18 @@ def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -
     """The scene of a checkpoint with the contents ``loaded``, on the CPU; ``CheckpointError`` if they do not fit."""
     options = model_options(config)
     gaussians, state = checkpoint.gaussians_of(loaded, source), checkpoint.model_state(loaded)
-    extra = found if isinstance(found := state.get(checkpoint.EXTRA_STATE), Mapping) else {}
+    extra = entries if isinstance(entries := state.get(checkpoint.EXTRA_STATE), Mapping) else {}
     focal = extra.get("trained_focal")
     head = _head_of(state, options, source) if extra.get("head_enabled") else None
     if head is not None:
         gaussians[FEATURES] = state[f"gauss_params.{FEATURES}"].float()
-    degree, interval = gaussians.sh_degree, options.get("sh_degree_interval")
+    interval = options.get("sh_degree_interval")
     if options.get("warm_start") is None and isinstance(interval, int):
-        degree = min(degree, int(loaded["step"]) // max(interval, 1))  # training did not reach the others
-    gaussians["features_rest"] = gaussians["features_rest"][:, : (degree + 1) ** 2 - 1]
+        degree = int(loaded["step"]) // max(interval, 1)  # training did not reach higher ones
+        gaussians["features_rest"] = gaussians["features_rest"][:, : (degree + 1) ** 2 - 1]
     gaussians = formats.usable(gaussians, source).gaussians
-    frame, upright = None, orientation_of(config) in ("up", "vertical")  # by default z is up
+    upright = orientation_of(config) in ("up", "vertical")  # by default z is up
+    frame = None
     with suppress(DataError, KeyError, TypeError, ValueError):
         stated = read_json(config.parent / FRAME_FILE)
         frame = {"transform": stated["transform"], "scale": float(stated["scale"])}

@@ -39,7 +39,8 @@ def scene_of(packed: PackedScene) -> Scene:
     if not is_frame(meta.get("frame")):
         meta.pop("frame", None)
     up, start = start_of(packed.meta)
-    cameras, arrays = tuple[Camera, ...](), packed.cameras
+    cameras: tuple[Camera, ...] = ()
+    arrays = packed.cameras
     if arrays is not None:
         rows = zip(arrays["poses"], arrays["intrinsics"].tolist(), arrays["sizes"].tolist(), strict=True)
         cameras = tuple(Camera.from_pose(pose, intrinsics, *size) for pose, intrinsics, size in rows)
@@ -153,8 +154,8 @@ def _of_harmonics(means: Tensor, cameras: Sequence[Camera], degree: int) -> Tens
     for camera in cameras:
         x, y, z = (chosen @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]).T
         across, down = x / z * camera.K[0, 0] + camera.K[0, 2], y / z * camera.K[1, 1] + camera.K[1, 2]
-        seen = chosen[(z > 0) & (across >= 0) & (across < camera.width) & (down >= 0) & (down < camera.height)]
-        basis = harmonic_basis(degree, torch.nn.functional.normalize(seen - camera.center, dim=1))[:, 1:].double()
+        visible = chosen[(z > 0) & (across >= 0) & (across < camera.width) & (down >= 0) & (down < camera.height)]
+        basis = harmonic_basis(degree, torch.nn.functional.normalize(visible - camera.center, dim=1))[:, 1:].double()
         total += basis.T @ basis
     # A little of the identity: a form without any view is singular.
     return total + 1e-6 * (1 + total.trace()) * torch.eye(len(total), dtype=torch.float64)

@@ -39,7 +39,7 @@ REFIT = {"cpu": (192, 1, 0.7), "cuda": (128, 4, 1.0)}  # steps of a refit, image
 REFIT_PIXELS, MOST_PIXELS = 1 << 18, 1 << 22  # most pixels of an image of a refit, and of one that tells what is seen
 SAMPLED = 64, 8192  # random Gaussians of two files, which tell the bytes of each more one
 LEAST, AIM = 0.97, 0.985  # shares of the size: what is near enough, and what each file aims at
-JUDGES, PIXELS = 8, 1 << 16  # cameras that compare candidates, and most pixels of their images
+JUDGES, PIXELS = 8, 1 << 16  # cameras that compare fits and forms, and most pixels of their images for forms
 MOST_FILES = 8  # of the last search
 T = TypeVar("T")
 
@@ -49,7 +49,7 @@ class PrunedScene(NamedTuple):
 
     scene: Scene
     mask: Tensor  # True for kept Gaussians of the scene before the prune, bool [N]
-    seen: float | None = None  # share of the finite Gaussians that the cameras see; None if none was asked
+    seen_share: float | None = None  # of the finite Gaussians, those that the cameras see; None if none was asked
     moved: bool = False  # whether kept Gaussians have other values than before
 
 
@@ -110,26 +110,28 @@ def prune_with_mask(
         raise ConfigError("prune needs either keep (a share) or count (a number of Gaussians); give one of them")
     if keep is not None and not 0 < float(numbers(keep, "keep", ())) <= 1:
         raise ConfigError(f"keep is {keep}; give a share in (0, 1], 0.1 to keep a tenth")
-    rule, sanitised = rule or PruneRule(), sanitise(scene.gaussians)
-    n = sanitised.gaussians.num_gaussians
-    count = whole(count, "count") if keep is None else kept_count(keep, n)
-    usable, given = dataclasses.replace(scene, gaussians=sanitised.gaussians), cameras or ()
-    console, images = Console(stderr=True) if progress and sys.stderr.isatty() else None, list[Tensor]()
-    if not rule.uses_contribution or count >= n:
+    rule = rule or PruneRule()
+    sanitised = sanitise(scene.gaussians)
+    usable = dataclasses.replace(scene, gaussians=sanitised.gaussians)
+    count = whole(count, "count") if keep is None else kept_count(keep, len(usable))
+    console = Console(stderr=True) if progress and sys.stderr.isatty() else None
+    images: list[Tensor] = []
+    if not rule.uses_contribution or count >= len(usable):
         weights = None
     elif weights is None:
-        given = cameras if cameras is not None else scene.cameras or virtual_cameras(usable)
-        weights = weights_in(usable, given, count if rule.uses_detail else None, console, images if fit else None)
+        cameras = cameras if cameras is not None else scene.cameras or virtual_cameras(usable)
+        weights = weights_in(usable, cameras, count if rule.uses_detail else None, console, images if fit else None)
     cut = prune_gaussians(sanitised.gaussians, rule, count, weights, graph)
-    small, mask = dataclasses.replace(scene, gaussians=cut.gaussians), within(sanitised.mask, cut.decision.mask)
-    seen = None if weights is None else float((weights > 0).float().mean())
-    pruned = PrunedScene(small, mask, seen, rule.redistribution == "merge" and count < n)
-    return fitted(pruned, usable, given, rule, images=images, console=console) if fit else pruned
+    small = dataclasses.replace(scene, gaussians=cut.gaussians)
+    share = None if weights is None else float((weights > 0).float().mean())
+    moved = rule.redistribution == "merge" and count < len(usable)
+    pruned = PrunedScene(small, within(sanitised.mask, cut.decision.mask), share, moved)
+    return fitted(pruned, usable, cameras or (), rule, images=images, console=console) if fit else pruned
 
 
 def fitted(pruned: PrunedScene, full: Scene, cameras: Sequence[Camera], rule: PruneRule, **options: Any) -> PrunedScene:
     """What is kept of a finite scene, fitted by :func:`refit` with its ``options`` if the rule and the cameras do."""
-    if pruned.seen is None or not rule.refits:
+    if pruned.seen_share is None or not rule.refits:
         return pruned
     unit, scaled, size = of_unit_size(full, cameras)
     small, settings = resized(pruned.scene.gaussians, 1 / size), full.settings(head=False)
@@ -177,8 +179,8 @@ def refit(
     steps, views, factor = by_device(REFIT, small["means"].device)
     cameras = [at_most(camera, REFIT_PIXELS) for camera in cameras]
     order = torch.randperm(len(cameras), generator=torch.Generator().manual_seed(seed)).tolist()
-    # Eight cameras that no step uses judge, if there are twice as many.
-    judges, trained = (order[:8], order[8:]) if len(order) >= 16 else (order, order)
+    # Cameras that no step uses judge, if there are twice as many.
+    judges, trained = (order[:JUDGES], order[JUDGES:]) if len(order) >= 2 * JUDGES else (order, order)
     truths = dict(enumerate(images))
     size = small["scales"].exp().sort(dim=1).values[:, 1:].mean(dim=1, keepdim=True)
     # The rates are the size of the first steps, for a prune to 15% or fewer; with more Gaussians less is left to fit.
@@ -220,8 +222,7 @@ def _blended(gaussians: Gaussians, cameras: Sequence[Camera], settings: RenderSe
         return [image for camera in cameras for image in _blended(gaussians, [camera], settings)]
     primitives = [GaussianSource(gaussians).primitives(camera, settings, features=False) for camera in cameras]
     colors = torch.stack([each["colors"] for each in primitives])
-    # What blends to the accumulation is 1 everywhere.
-    channels = torch.cat([colors, torch.ones_like(colors[..., :1])], dim=2)
+    channels = torch.cat([colors, torch.ones_like(colors[..., :1])], dim=2)  # ones blend to the accumulation
     inputs = pass_inputs(primitives[0], cameras[0], settings, channels)
     viewmats, Ks = torch.stack([camera.viewmat for camera in cameras]), torch.stack([camera.K for camera in cameras])
     return list(rasterize_cameras(inputs, viewmats, Ks, backend=settings.backend))
@@ -271,7 +272,7 @@ class Form(NamedTuple):
 
     @property
     def precision(self) -> PackConfig:
-        """That of a pack."""
+        """Options of a pack with these steps."""
         return scaled(PackConfig(), self.power)
 
     def of(self, scene: Scene) -> Scene:
@@ -293,7 +294,8 @@ def prune_to_bytes(
     The scene is finite; ``write`` makes the content. Every eighth of the ``cameras`` compares the forms. Bars and
     remarks go to stderr. ``ConfigError`` if hardly a Gaussian fits.
     """
-    n, packs, file_of = scene.num_gaussians, len({form.power for form in forms}) > 1, cache(write)
+    n, file_of = scene.num_gaussians, cache(write)
+    packs = len({form.power for form in forms}) > 1
 
     def bytes_of(pruned: PrunedScene, form: Form) -> int:
         return len(file_of(pruned, form))
@@ -358,9 +360,9 @@ def _nearest_form(
     truths, as_read = [render(scene, camera).rgb for camera in judges], _as_packed if packs else Form.of
     psnr = -math.inf
     for form, pruned in candidates:
-        if (found := measure(as_read(form, pruned.scene), truths, judges).psnr) <= psnr:
+        if (new := measure(as_read(form, pruned.scene), truths, judges).psnr) <= psnr:
             break  # more Gaussians no longer make up for it
-        best, psnr = (form, pruned), found
+        best, psnr = (form, pruned), new
     return best
 
 

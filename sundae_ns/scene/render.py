@@ -83,19 +83,15 @@ class GaussianSource:
 
 
 def pass_inputs(
-    params: Mapping[str, Tensor],
-    camera: Camera,
-    settings: RenderSettings,
-    channels: Tensor | None = None,
-    **options: Any,
+    params: Mapping[str, Tensor], camera: Camera, settings: RenderSettings, channels: Tensor | None = None, **extra: Any
 ) -> Inputs:
-    """Arguments of a splatting pass: activated parameters, channels ``[N, C]`` or 1, camera, settings and options."""
+    """Arguments of a splatting pass: activated parameters, channels ``[N, C]`` or 1, camera, settings, and others."""
     colors = torch.ones_like(params["means"][:, :1]) if channels is None else channels
     opacities = params["opacities"].sigmoid().squeeze(-1)
     if settings.drop_rate > 0:  # The others make up for them (Park et al., "DropGaussian", 2025)
         opacities = torch.nn.functional.dropout(opacities, settings.drop_rate).clamp(max=1)
     splats = (params["means"], params["quats"], params["scales"].exp(), opacities, colors)
-    return Inputs(*splats, camera, near_plane=NEAR_PLANE, antialiased=settings.antialiased, **options)
+    return Inputs(*splats, camera, near_plane=NEAR_PLANE, antialiased=settings.antialiased, **extra)
 
 
 def splat(
@@ -216,13 +212,13 @@ def contribution(
         if total.is_cpu:  # a GPU culls faster than it picks rows
             pose = camera.viewmat[None], camera.K[None], torch.tensor([[camera.width, camera.height]])
             rows = may_be_seen(source.gaussians["means"], source.gaussians["scales"], *pose)[0].nonzero().squeeze(1)
-        seen = GaussianSource(source.gaussians.rows(rows)) if total.is_cpu else source
+        visible = GaussianSource(source.gaussians.rows(rows)) if total.is_cpu else source
         pixels = None if mask is None else mask[..., 0].to(total)
         if count is None:
-            inputs = pass_inputs(seen.gaussians, camera, settings)
+            inputs = pass_inputs(visible.gaussians, camera, settings)
             return rows, blending_weights(inputs, pixels, backend=settings.backend), None
         # As in blending_weights, but one pass gives the image and the weights: the gradient of the first channel.
-        fixed = {name: value.detach() for name, value in seen.primitives(camera, settings, features=False).items()}
+        fixed = {name: value.detach() for name, value in visible.primitives(camera, settings, features=False).items()}
         colors = fixed["colors"].requires_grad_()
         with torch.enable_grad():
             drawn, splatted = draw(fixed, camera, background.to(total), replace(settings, head=None), depth=False)

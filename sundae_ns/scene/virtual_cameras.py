@@ -219,8 +219,8 @@ def _coarseness(scene: Scene, sizes: Tensor, eyes: Tensor, targets: Tensor, even
         angles = (sizes - distances.log()).clamp_max(0)
         # Blending adds nothing where nothing is seen: the logarithm of one radian.
         powers = torch.stack([angles, angles.square()][: 2 if evenness else 1], dim=-1)
-        Ks, colored = camera.K.expand(len(powers), 3, 3), dataclasses.replace(inputs, colors=powers)
-        images = rasterize_cameras(colored, viewmats[some], Ks, backend=settings.backend)
+        probes = dataclasses.replace(inputs, colors=powers)
+        images = rasterize_cameras(probes, viewmats[some], camera.K.expand(len(powers), 3, 3), backend=settings.backend)
         mean, *squares = images.mean(dim=(1, 2)).unbind(dim=1)
         for square in squares:
             mean = mean + evenness * (square - mean.square()).clamp_min(0).sqrt()

@@ -143,7 +143,7 @@ def test_a_scene_of_any_size_is_pruned_alike(factor):
     """The near plane is 0.01 world units away, which is more than the whole of a small scene."""
     moved = sn.transform(scene(), scale=factor)
     own, other = (prune_with_mask(each, 0.3) for each in (scene(), moved))
-    assert other.seen == own.seen
+    assert other.seen_share == own.seen_share
     assert (own.mask == other.mask).float().mean() > 0.95
 
 
