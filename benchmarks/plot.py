@@ -43,9 +43,8 @@ def logarithmic(panel: Any, ticks: list[float]) -> None:
 
 def legend(figure: Any) -> None:
     """One legend for all panels."""
-    found = [panel.get_legend_handles_labels() for panel in figure.axes]
-    seen = {name: line for handles, names in found for line, name in zip(handles, names, strict=True)}
-    figure.legend(seen.values(), seen, fontsize=9, loc="outside lower center", ncols=4)
+    lines = {line.get_label(): line for panel in figure.axes for line in panel.get_legend_handles_labels()[0]}
+    figure.legend(lines.values(), lines, fontsize=9, loc="outside lower center", ncols=4)
 
 
 def plot_curve() -> Any:
@@ -63,16 +62,16 @@ def plot_curve() -> Any:
         stock = [row for row in packs if row["capture"] == capture]
         kinds = [("packed_", fixed, "o-", "fixed shares"), ("packed_", chosen, "D", "sundae")]
         kinds += [("tuned_", chosen, "P", "sundae, fine-tuned"), ("", stock, "s", "splatfacto")]
-        for kind, found, marker, label in kinds:
-            places = [(int(row[f"{kind}bytes"]) / MB, float(row[f"{kind}{metric}"])) for row in found]
-            color = STYLES[label][1]
-            panel.plot(*zip(*places), marker, color=color, label=label, markersize=7)
-            for place, row in zip(places, found, strict=True):
+        for kind, packed, marker, label in kinds:
+            spots = [(int(row[f"{kind}bytes"]) / MB, float(row[f"{kind}{metric}"])) for row in packed]
+            style: dict[str, Any] = {"color": STYLES[label][1], "markersize": 7}
+            panel.plot(*zip(*spots), marker, label=label, **style)
+            for spot, row in zip(spots, packed, strict=True):
                 if kind == "packed_" and row["head"] == "no":
-                    panel.plot(*place, marker[0], color=color, markerfacecolor="white", markersize=7)
-                if found is fixed:
+                    panel.plot(*spot, marker[0], markerfacecolor="white", **style)
+                if packed is fixed:
                     share = f"{100 * float(row['share']):g}%"
-                    panel.annotate(share, place, (4, -10), textcoords="offset points", fontsize=7)
+                    panel.annotate(share, spot, (4, -10), textcoords="offset points", fontsize=7)
         logarithmic(panel, [0.3, 1, 3, 10])
         panel.margins(y=0.12)
         panel.set(**({"title": capture} if metric == "psnr" else {"xlabel": "MB, packed"}))
@@ -94,21 +93,20 @@ def plot_error() -> Any:
     for row in lines_of("frames.jsonl"):
         capture, method, *_ = row["config"].split(", ")
         marks.append((2, capture, method, row["ms_frame"], row["psnr"]))
-    stock = {(place, capture): psnr for place, capture, method, _, psnr in marks if method == "splatfacto"}
+    stock = {(number, capture): psnr for number, capture, method, _, psnr in marks if method == "splatfacto"}
     figure, ((seconds, sizes), (frames, graph)) = plt.subplots(2, 2, figsize=(10, 7.5), layout="constrained")
     panels = (seconds, sizes, frames)
-    for (place, capture), zero in stock.items():
-        own = sorted((x, psnr - zero, method) for *where, method, x, psnr in marks if where == [place, capture])
-        color = f"C{sorted({name for _, name in stock}).index(capture)}"
-        panels[place].plot([x for x, *_ in own], [y for _, y, _ in own], color=color, linewidth=0.7, zorder=1)
-        for x, y, method in own:
-            panels[place].plot(x, y, STYLES[method][0], color=STYLES[method][1], label=method)
-        best = max(own, key=lambda mark: mark[1])
+    for (number, capture), zero in stock.items():
+        panel, color = panels[number], f"C{sorted({name for _, name in stock}).index(capture)}"
+        spots = sorted((x, psnr - zero, method) for *where, method, x, psnr in marks if where == [number, capture])
+        panel.plot([x for x, *_ in spots], [y for _, y, _ in spots], color=color, linewidth=0.7, zorder=1)
+        for x, y, method in spots:
+            panel.plot(x, y, STYLES[method][0], color=STYLES[method][1], label=method)
+        best = max(spots, key=lambda spot: spot[1])
         offset = (6, -10 if capture == "dinosaur" else 5)  # beside stone_horse
-        panels[place].annotate(capture, best[:2], offset, textcoords="offset points", fontsize=8, color=color)
+        panel.annotate(capture, best[:2], offset, textcoords="offset points", fontsize=8, color=color)
     for panel, label in zip(panels, ("seconds of training", "MB, packed", "milliseconds a frame")):
-        panel.set(xlabel=label, ylabel="test PSNR over splatfacto's, dB")
-        panel.margins(0.16, 0.1)
+        panel.set(xlabel=label, ylabel="test PSNR over splatfacto's, dB", xmargin=0.16, ymargin=0.1)
     logarithmic(seconds, [30, 100, 300])
     logarithmic(sizes, [0.3, 1, 3, 10])
     frames.set_xlim(0)
@@ -151,13 +149,15 @@ def plot_asked() -> Any:
     figure, ((sizes, levels, cleaning), (few, light, rules)) = plt.subplots(2, 3, figsize=(11, 7), layout="constrained")
     lines(sizes, "sizes_asked.csv", lambda row: f"{row['capture']} ({row['source']})", "got_mb", "psnr")
     lines(levels, "levels.csv", lambda row: row["tool"], "share", "psnr_to_field")
+    left_out = [row for row in lines_of("few_counts.csv") if (row["views"], row["arm"]) == ("16", "drop rate 0.2")]
+    few.axhline(mean(left_out, "psnr"), color="black", linestyle="--", label="16 views, default: a fifth left out")
     lines(few, "few_counts.csv", few_photos, "arm", "psnr")
     lines(light, "gains.csv", changed_light, "capture", "psnr")
     lines(cleaning, "cleaning.csv", lambda row: row["others_removed"] and row["strength"], "psnr_lost", "removed")
     sizes.set(title="asked sizes", xlabel="MB got", ylabel="PSNR, dB")
     levels.set(title="levels, mean of fields", xlabel="share of Gaussians", ylabel="PSNR to the field, dB")
-    cleaning.set(title="cleaning by strength", xlabel="PSNR lost, dB", ylabel="floaters found of 400", ylim=(0, 400))
-    few.set(title="few photos, mean of captures", xlabel="Gaussians kept, %", ylabel="test PSNR, dB")
+    cleaning.set(title="cleaning by strength", xlabel="PSNR lost, dB", ylabel="floaters found of 400", ylim=(360, 401))
+    few.set(title="few photos, mean of captures", xlabel="Gaussians kept, %", ylabel="test PSNR, dB", ylim=(18.2, 24.2))
     light.set(title="exposures changed by 15%", ylabel="test PSNR, dB")
     light.margins(0.3)
     lines(rules, "rules.csv", lambda row: row["scene"] == "bonsai" and RULES.get(row["rule"]), "keep", "psnr")
