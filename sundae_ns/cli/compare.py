@@ -6,6 +6,7 @@ import json
 import math
 import shlex
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,7 +15,7 @@ from typing import Annotated
 import tyro
 from rich.markup import escape
 
-from sundae_ns.cli.inputs import chosen_cameras, is_run
+from sundae_ns.cli.inputs import chosen_cameras, is_run, open_run
 from sundae_ns.cli.main import typed
 from sundae_ns.cli.options import File, Flag, Float, Int, Overwrite, progress_bar
 from sundae_ns.cli.refusals import check_folder, check_least
@@ -49,8 +50,7 @@ def compare(
         scenes: files and runs of all kinds that sundae reads; no code in them runs.
         out: folder for a web page with sliders (report.html), and for the table as report.md, .csv and .json.
         data: capture whose test photos are the truth, or that of a run if it has moved.
-        cameras: a transforms.json, a COLMAP model (sparse/0), a camera path, a run or a packed scene: the images of the
-            first scene from its cameras are the truth, of runs too.
+        cameras: transforms.json, COLMAP model, camera path, run or pack: images of the first scene by it are the truth.
         num_cameras: most cameras, evenly spaced, or the number of virtual ones.
         formats: compare a scene with itself in every format: what each costs.
         min_psnr: exit with 1 if the mean PSNR of a scene is lower, dB.
@@ -65,6 +65,8 @@ def compare(
     if len(scenes) < (1 if photos or formats else 2):
         given = f"{scenes[0]} is one scene" if scenes else "there is no scene"
         raise ConfigError(f"{given}; give another, --formats, or --data with a capture")
+    if formats and len(scenes) > 1:
+        raise ConfigError(f"--formats compares one scene with itself; leave out {scenes[1]}, or --formats")
     first = None if photos else load(scenes[0]).to(fastest_device())
     from sundae_ns.report.measure import against_first, against_photos, csv_text, labels_of, markdown, measure
     from sundae_ns.report.report_page import ShownRun, report_page, shown_views
@@ -78,11 +80,9 @@ def compare(
     measured_by = partial(measure, lpips=lpips, repeats=repeats, command=command)
     with progress_bar() as progress, TemporaryDirectory() as folder:
         if formats:
-            source, suffix = load(scenes[0]) if first is None else first.to("cpu"), scenes[0].suffix.lower()
-            others = [Path(folder, scenes[0].stem + other) for other in (*FORMATS, ".sundae") if other != suffix]
-            for path in progress.track(others, description="Writing all formats"):
-                save(source, path)
-            scenes = [scenes[0], *others]
+            whole = open_run(scenes[0], max_cameras=100, data=data) if is_run(scenes[0]) else load(scenes[0])
+            others = (other for other in (*FORMATS, ".sundae") if other != scenes[0].suffix.lower())
+            scenes += [Path(folder, scenes[0].stem + other) for other in others]
         opened = against_photos(data)
         if first is not None:
             chosen = held_out_cameras(first, chosen_cameras(first, cameras, num_cameras), num_cameras)
@@ -90,15 +90,18 @@ def compare(
         for path, label in zip(scenes, labels_of(scenes), strict=True):
             task = progress.add_task(f"Opening {escape(label)}", total=None)
             try:
+                if formats and path != scenes[0]:
+                    save(whole, path)
                 subject = opened(path)
                 progress.update(task, description=f"Measuring {escape(label)}", total=len(subject.truths))
                 measured = measured_by(subject, label=label, progress=partial(progress.advance, task))
+                measured = replace(measured, source=str(scenes[0] if formats else measured.source))
                 views = [] if out is None else shown_views(subject, measured, len(scenes))
                 curve = read_count_curve(Path(measured.source)) if subject.file_bytes is None else None
                 done.append(ShownRun(measured, views, curve, subject.capture))
             except SundaeError as error:  # keep the measurements of the others
                 failures.append(error)
-                notes.append(f"{path}: {error}")
+                notes.append(f"{path}: {error}".replace(str(path), label))
             progress.remove_task(task)
     if not done:
         raise failures[0]

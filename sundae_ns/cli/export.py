@@ -54,8 +54,8 @@ def export(
     wishes.check_wishes()
     suffix, upright = out.suffix.lower(), advanced.upright
     page = suffix in (".html", "") and not lod
-    if lod and suffix:
-        raise ConfigError(f"{out} is no folder, which levels of detail take; name one without a suffix")
+    if lod and (suffix or wishes.max_mb is not None):
+        raise ConfigError("--lod writes a folder of many files; name one without a suffix, and leave out --max-mb")
     if suffix:
         check_suffix(out, (*FORMATS, ".html"))
     reads = [*files_of(scene), beside, advanced.data, advanced.cameras]
@@ -72,13 +72,12 @@ def export(
     if upright and not left.scene.in_model_frame:
         raise ConfigError(f"{scene} is not in nerfstudio's coordinates, which --upright turns; leave it out")
     if page:
-        scenes = [before.for_page()]
-        if beside is not None:
-            scenes.append(opened(beside, Wishes(), SceneDetails(), capture=True).for_page())
+        second = [] if beside is None else [opened(beside, Wishes(), SceneDetails(), capture=True).for_page()]
         named = {name: link for name, _, link in (word.partition("=") for word in views)}
-        size, file = write_page(out, *scenes, views=named), out if suffix else out / "scene.sundae"
+        shown = before.for_page(out, lambda path, first: write_page(path, first, *second, views=named))
+        size, file = write_page(out, shown, *second, views=named), out if suffix else out / "scene.sundae"
         print(f"{out}: {size:,} bytes; {'open it in a browser' if suffix else 'serve it'}")
-        costs = kind_of(scene) != "packed" or scenes[0][1] is not before.scene
+        costs = kind_of(scene) != "packed" or shown[1] is not before.scene
     elif lod:
         from sundae_ns.plugin.distill import levels_of  # imports nerfstudio, which takes seconds
 

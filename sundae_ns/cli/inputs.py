@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from dataclasses import replace
 from io import StringIO
@@ -29,11 +29,11 @@ from sundae_ns.io.pack import container
 from sundae_ns.io.ply import has_own_columns, keep_vertices
 from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.rasterize.interface import fastest_device
-from sundae_ns.scene.cameras import cameras_of, opening, with_start
+from sundae_ns.scene.cameras import cameras_of, opening, spread, with_start
 from sundae_ns.scene.compose import crop_mask, floater_mask, transform
 from sundae_ns.scene.describe import write_preview
 from sundae_ns.scene.load_save import load, load_with_mask, save
-from sundae_ns.scene.page import Shown, shown_as
+from sundae_ns.scene.page import Shown, shown_as, write_page
 from sundae_ns.scene.prune_scene import Form, PrunedScene, count_for_drop, prune_to_bytes, prune_with_mask
 from sundae_ns.scene.scene import Scene, within
 from sundae_ns.scene.virtual_cameras import VIEWS, virtual_cameras
@@ -66,7 +66,7 @@ class Edit(NamedTuple):
         if self.file is not None:
             write_bytes(out, self.file)
         elif self.copies_rows(out):
-            moved = self.pruned is not None and self.pruned.moved
+            moved = (self.pruned and self.pruned.moved) or self.form.degree < self.scene.gaussians.sh_degree
             keep_vertices(self.source, out, self.rows, self.stated.gaussians if moved else None, self.scene.up)
         else:
             save(self.stated, out, config=self.form.precision)
@@ -107,17 +107,18 @@ class Edit(NamedTuple):
         num_cameras: int | None = None,
         target_drop: float | None = None,
         rounds: bool = True,
+        write: Callable[[Edit, Path], object] | None = None,
     ) -> Edit:
         """What the options leave of the scene; ``out`` is the file, or one like it, to be written.
 
-        ``rounds`` says whether a size also decides how it is rounded.
+        ``rounds`` says whether a size also decides how it is rounded; ``write`` makes what has the size, if not a file.
         """
         edit, wishes, count = self.cleaned(), self.wishes, self.wishes.count
         if not wishes.reduces and target_drop is None:
             return edit
         with naming_full_memory(lambda: len(self.rows)):
             scene, cameras = edit.scene.to(fastest_device()), edit.cameras
-            scene = opening(scene) if out.suffix.lower() == ".html" else scene  # once, not for each file of a search
+            scene = opening(scene) if out.suffix.lower() in (".html", "") else scene  # once, not for each file
             rule = replace(rule or PruneRule(), seed=self.details.seed or 0)
             if rule.uses_contribution or wishes.max_mb is not None or target_drop is not None:
                 cameras = cameras or virtual_cameras(scene, num_cameras, seed=rule.seed)
@@ -132,25 +133,31 @@ class Edit(NamedTuple):
 
             if wishes.max_mb is None:
                 return after(prune_with_mask(scene, wishes.keep, count, cameras, rule, progress=True))
-            # All columns of a .ply stay.
-            forms = Form.choices(scene, out.suffix.lower())[: 1 if self.copies_rows(out) or not rounds else None]
+            forms = Form.choices(scene, out.suffix.lower())[: None if rounds else 1]
 
             def file_of(pruned: PrunedScene, form: Form) -> bytes:
-                after(pruned, form).write(Path(folder, out.name))
-                return Path(folder, out.name).read_bytes()
+                (write or Edit.write)(after(pruned, form), Path(folder, out.name))
+                return b"".join(path.read_bytes() for path in Path(folder).rglob("*") if path.is_file())
 
             most = int(wishes.max_mb * MEGABYTE)
             with TemporaryDirectory() as folder:
                 pruned, form, file = prune_to_bytes(scene, most, file_of, forms, cameras, rule)
             return after(pruned, form)._replace(file=file)
 
-    def for_page(self) -> Shown:
-        """Name, scene and packed file of what a page shows; a packed scene stays as it is."""
-        left, details, source = self.reduced(Path("page.html")), self.details, self.source.resolve()
+    def for_page(self, out: Path = Path("page.html"), write: Callable[[Path, Shown], object] = write_page) -> Shown:
+        """Name, scene and packed file of what a page shows, which ``write`` makes; a packed scene stays as it is."""
+        details, source = self.details, self.source.resolve()
         name = (source.parent if source.name == "scene.sundae" else source).stem  # sundae run names all packs so
         if is_run(self.source):  # its file is CAPTURE/METHOD/TIME/config.yml
             name = config_of(self.source).resolve().parents[2].name
-        if kind_of(self.source) != "packed" or self.wishes.cleans or self.wishes.reduces or details.no_head:
+        left = self.reduced(out, write=lambda edit, path: write(path, shown_as(name, edit.stated, edit.form.precision)))
+        if (
+            kind_of(self.source) != "packed"
+            or self.wishes.cleans
+            or self.wishes.reduces
+            or details.no_head
+            or details.cameras
+        ):
             return shown_as(name, left.stated, left.form.precision)
         packed = self.source.read_bytes()
         if details.start_view is not None or details.up is not None:
@@ -180,7 +187,7 @@ class Edit(NamedTuple):
 
 
 def opened(source: Path, wishes: Wishes, details: SceneDetails, *, capture: bool = False, most: int = 100) -> Edit:
-    """A scene before its wishes, upright and started by its details; ``capture`` asks for ``most`` cameras of a run."""
+    """A scene before its wishes, with up, start and cameras of its details; ``capture`` asks for ``most`` of a run."""
     if details.preview is not None:
         if wishes.remove_floaters is None:
             raise ConfigError("--preview shows what --remove-floaters changes; add it")
@@ -189,11 +196,13 @@ def opened(source: Path, wishes: Wishes, details: SceneDetails, *, capture: bool
         scene, rows = open_run(source, max_cameras=most, data=details.data), None
     else:
         scene, rows = load_with_mask(source)
+    cameras = chosen_cameras(scene, details.cameras, None)
+    scene = replace(scene, cameras=tuple(cameras[i] for i in spread(len(cameras), most)))
     scene = with_start(scene, details.start_view, details.up)
     rows = torch.ones(len(scene), dtype=torch.bool) if rows is None else rows
     if wishes.count is not None and wishes.count > len(scene):
         print(f"warning: {source} has {len(scene):,} Gaussians, not {wishes.count:,}; all are kept", file=sys.stderr)
-    return Edit(source, wishes, details, scene, rows, chosen_cameras(scene, details.cameras, None))
+    return Edit(source, wishes, details, scene, rows, cameras)
 
 
 def open_run(run: Path, **options: Any) -> Scene:

@@ -37,6 +37,7 @@ _SCENES = (
     ".splat, .ksplat or gsplat's .pt."
 )
 Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(help=_SCENES)]
+Rest = Annotated[tuple[str, ...], tyro.conf.Positional, NO_DEFAULT, tyro.conf.arg(metavar="[-- OPTION ...]")]
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]  # without a --no- form
 Overwrite = Annotated[Flag, tyro.conf.arg(help="replace an earlier output, once the new one is complete.")]

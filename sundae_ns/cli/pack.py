@@ -12,7 +12,7 @@ from json import dumps
 from typing import TYPE_CHECKING, Any
 
 from sundae_ns.cli.inputs import opened
-from sundae_ns.cli.options import Advanced, Flag, Float, Input, Out, Plain, SceneDetails, Wishes, progress_bar, words_of
+from sundae_ns.cli.options import Advanced, Flag, Float, Out, Plain, Scene, SceneDetails, Wishes, progress_bar, words_of
 from sundae_ns.cli.refusals import check_exclusive, check_file, check_least
 from sundae_ns.core.errors import ConfigError, SundaeError
 from sundae_ns.core.tables import MEGABYTE, without_nan
@@ -21,7 +21,6 @@ from sundae_ns.io.formats import PRIMITIVES, kind_of, kind_of_gaussians
 from sundae_ns.io.pack.config import FINETUNED, FINETUNED_SIZE, PackConfig
 from sundae_ns.io.pack.packed_scene import Codecs, PackedScene, fit_scene, pack_bytes, write_fitted
 from sundae_ns.io.run_folder import files_of
-from sundae_ns.scene.cameras import spread
 from sundae_ns.scene.packing import contents_of
 
 if TYPE_CHECKING:
@@ -43,7 +42,7 @@ class PackDetails(SceneDetails):
 
 
 def pack(
-    run: Input,
+    run: Scene,
     out: Out,
     wishes: Plain[Wishes] = Wishes(),  # noqa: B008
     advanced: Advanced[PackDetails] = PackDetails(),  # noqa: B008
@@ -51,8 +50,6 @@ def pack(
     """Pack a scene into one file that can be rendered; print the size of each part, and the quality before and after.
 
     Args:
-        run: a run of sundae or splatfacto (its folder or config.yml), or a .ply, .spz, .sog, .glb, .splat,
-            .ksplat, gsplat's .pt, or a .sundae or its page (.html) to pack again.
         out: file to write, for example scene.sundae.
     """
     finetune, target_drop, max_mb = advanced.finetune, advanced.target_drop, wishes.max_mb
@@ -71,8 +68,7 @@ def pack(
     before = opened(run, wishes, advanced, capture=True, most=advanced.max_cameras)
     # A fine-tune shrinks the file, and the search below rounds it to its size.
     larger = None if max_mb is None else max_mb / (FINETUNED_SIZE if finetune else 1)
-    stored = tuple(before.scene.cameras[i] for i in spread(len(before.scene.cameras), advanced.max_cameras))
-    asked = before._replace(scene=replace(before.scene, cameras=stored), wishes=replace(wishes, max_mb=larger))
+    asked = before._replace(wishes=replace(wishes, max_mb=larger))
     left = asked.reduced(out.with_suffix(".sundae"), rounds=not finetune)
     source, packs = contents_of(left.stated), list[tuple[PackedScene, Codecs]]()
     figures: dict[str, Any] = {}

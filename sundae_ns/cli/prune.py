@@ -56,9 +56,8 @@ def prune(
         out: file to write, by its suffix .ply, .spz, .sog, .glb, .sundae or .html; a .ply of a .ply keeps all columns.
         target_drop: keep as few as lose at most this PSNR, in dB, of a full scene that shows its photos at 30 dB; by
             the images of held-out cameras.
-        distill: train what is kept on the full scene's images, each from a camera of its own near the scene's or
-            virtual ones, with a head if cameras that no step sees show that it pays. Ctrl-C saves; the same command
-            resumes.
+        distill: train what is kept on the full scene's images, from cameras near the scene's or virtual ones, with a
+            head if cameras that no step sees show that it pays. Ctrl-C saves; the same command resumes.
     """
     wishes.check_wishes(target_drop=target_drop)
     check_least(target_drop=(target_drop, 0.001))

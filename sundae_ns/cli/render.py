@@ -7,12 +7,12 @@ from pathlib import Path
 from rich.console import Console
 
 from sundae_ns.cli.inputs import opened
-from sundae_ns.cli.options import Advanced, File, Float, Int, Out, Plain, Scene, SceneDetails, Wishes, progress_bar
+from sundae_ns.cli.options import Advanced, Float, Int, Out, Plain, Scene, SceneDetails, Wishes, progress_bar
 from sundae_ns.cli.refusals import check_file, check_least, check_suffix
 from sundae_ns.core.errors import ConfigError
 from sundae_ns.core.files import replacing, write_image, write_video
 from sundae_ns.rasterize.interface import fastest_device
-from sundae_ns.scene.cameras import film_views, opening, read_cameras
+from sundae_ns.scene.cameras import MOST_CAMERAS, film_views, opening, read_cameras
 from sundae_ns.scene.scene import image_of
 from sundae_ns.scene.scene import render as render_view
 
@@ -22,7 +22,6 @@ IMAGES = (".png", ".jpg", ".jpeg", ".webp")
 def render(
     scene: Scene,
     out: Out,
-    camera: File = None,
     view: Int = None,
     width: Int = None,
     seconds: Float = None,
@@ -32,32 +31,31 @@ def render(
 ) -> int:
     """Render a scene to an image, or along a path to a video.
 
-    Without --camera, a video is a film along a closed, smooth path through stored cameras, else where detail is seen.
+    A video is a film on a smooth path through the cameras, or where detail is seen; of a camera path, all its frames.
 
     Args:
         out: image (.png, .jpg or .webp) or video (.mp4) to write.
-        camera: a transforms.json or a camera path of the viewer; by default the cameras stored with the scene.
         view: index of the camera for an image; by default the start view of the scene, if it has one.
         width: width of the images in pixels; by default that of the camera, in a film at most 1,280 a side.
-        seconds: length of a film without --camera; by default 12.
+        seconds: length of a film; by default 12.
         fps: frames a second of a video; by default those of the camera path, else 24.
     """
     video = check_suffix(out, (*IMAGES, ".mp4")) == ".mp4"
     check_least(width=(width, 2))
-    if seconds is not None and (camera is not None or not video):
-        raise ConfigError("--seconds is the length of a film without --camera; leave it out")
     if fps is not None and not (video and 0 < fps <= 240):
         raise ConfigError("--fps is of a video, from above 0 to 240; leave it out, or name a video .mp4")
     wishes.check_wishes()
-    check_file(out, reads=[scene, camera, advanced.cameras], overwrite=advanced.overwrite)
-    left = opened(scene, wishes, advanced).reduced(Path("scene.sundae")).stated
+    check_file(out, reads=[scene, path := advanced.cameras], overwrite=advanced.overwrite)
+    left = opened(scene, wishes, advanced, most=MOST_CAMERAS).reduced(Path("scene.sundae")).stated
     views, speed = list(left.cameras), None
-    if camera is not None:
-        views, speed = read_cameras(camera, left)
-    elif video:
+    if video and path is not None and path.is_file() and path.suffix.lower() == ".json":
+        views, speed = read_cameras(path, left)  # the speed of a camera path
+    if seconds is not None and (speed is not None or not video):
+        raise ConfigError("--seconds is the length of a film without a camera path; leave it out")
+    if video and speed is None:
         with Console(stderr=True).status("Finding a path"):
             views = film_views(left, seconds=12.0 if seconds is None else seconds, frames_per_second=fps or 24)
-    elif view is None or not views:
+    elif (view is None and path is None) or not views:
         views = [start] if (start := opening(left).start) is not None else views
     views = [each if width is None else each.zoomed(width / each.width) for each in views]
     left = left.to(fastest_device())

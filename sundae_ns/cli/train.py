@@ -7,11 +7,8 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated
 
-import tyro
-
-from sundae_ns.cli.options import Advanced, Details, File, Flag, Input, Int, Out, Plain, Wishes, word, words_of
+from sundae_ns.cli.options import Advanced, Details, File, Flag, Input, Int, Out, Plain, Rest, Wishes, word, words_of
 from sundae_ns.cli.process import run_command
 from sundae_ns.cli.refusals import check_folder, check_least
 from sundae_ns.core.errors import STOPPED, ConfigError, DataError
@@ -40,8 +37,6 @@ class TrainOptions(Wishes):
             raise ConfigError(f"{self.method} is no method of sundae; use one of {', '.join(methods())}")
         self.check_wishes()
         check_least(steps=(self.steps, 1))
-        if self.max_mb is not None and self.method != "sundae":
-            raise ConfigError("--max-mb needs a method that decides the number of Gaussians; leave out --method")
 
     def words(
         self, capture: Path, out: Path, more: Sequence[str] = (), *, tunes: bool = False, masks: Path | None = None
@@ -52,12 +47,12 @@ class TrainOptions(Wishes):
         is a folder of them for a capture in COLMAP's layout.
         """
         words = ["ns-train", self.method, "--data", word(capture), "--output-dir", word(out)]
-        # Trials count the bytes of packs without a fine-tune.
-        most = None if self.max_mb is None else round(self.max_mb * MEGABYTE / (FINETUNED_SIZE if tunes else 1))
+        # Trials count the bytes of packs without a fine-tune. Of methods that try no counts the pack alone is limited.
+        most = round((self.max_mb or 0) * MEGABYTE / (FINETUNED_SIZE if tunes else 1))
         given = {
             "--pipeline.model.pruning.keep-ratio": self.keep,
             "--pipeline.model.pruning.target-gaussians": self.count,
-            "--pipeline.model.pruning.max-bytes": most,
+            "--pipeline.model.pruning.max-bytes": most or None if self.method == "sundae" else None,
             "--pipeline.model.head.mode": "off" if self.advanced.no_head else None,
             "--machine.seed": self.advanced.seed,
             "--max-num-iterations": self.steps,
@@ -86,7 +81,7 @@ def methods() -> list[str]:
 
 def train(
     capture: Input,
-    further: Annotated[tuple[str, ...], tyro.conf.Positional] = (),
+    further: Rest = (),
     out: Out = Path("outputs"),
     resume: Flag = False,
     masks: File = None,

@@ -159,17 +159,20 @@ def keep_vertices(
     """Copy a .ply with only some of its vertices, atomically; properties, comments and other elements are unchanged.
 
     The ``source`` has its values as :func:`has_own_columns` says. ``mask`` is True for vertices to keep, bool ``[N]``;
-    ``params`` are new parameters of these ``[M, ...]``, None to keep their values. ``up`` is stated by a comment, if it
-    is not. ``DataError`` if the file cannot be read, or has another number of vertices; ``StorageError`` if the disk is
-    full or not writable.
+    ``params`` are their new parameters ``[M, ...]``, None for no change; harmonics that these lack are left out. ``up``
+    becomes a comment. ``DataError`` if the file is unreadable or was changed; ``StorageError`` if it cannot write.
     """
     file = _Ply(source)
     start, count, kind = file.elements["vertex"]
     if count != len(mask):
         raise DataError(f"{source} has {count} vertices, not {len(mask)}: it was changed meanwhile; run again.")
-    rows = np.asarray(file.rows()[mask.cpu().numpy()])
+    rows, header = np.asarray(file.rows()[mask.cpu().numpy()]), file.header
     if params is not None:
         names, table = _table(params)
+        kept = {name: kind[name] for name in kind.names or () if name in names or not name.startswith("f_rest_")}
+        rows = rows[[*kept]].astype([*kept.items()])
+        line = rb"(?i)[\r\n]+property\s+\w+\s+(f_rest_\d+)"
+        header = re.sub(line, lambda m: m[0] * (m[1].decode().lower() in kept), header)
         for name, column in zip(names, table.T, strict=True):
             rows[name] = column
         _, offset = recentred(_columns(file.rows(), _COLUMNS["means"], np.float64))
@@ -180,11 +183,9 @@ def keep_vertices(
     known = up is None or math.dist(up, ply_marks(source).up or (0, 0, 0)) < 1e-6
     line = b"" if known else rb"comment %s\g<1>" % comments_of(Marks(up=up))[0].encode()
     vertex, new = rb"(?i)([\r\n]+)(element\s+vertex\s+)\d+", rb"\g<1>%s\g<2>%d" % (line, len(rows))
-    header = re.sub(vertex, new, file.header, count=1)
     with replacing(out) as partial, partial.open("wb") as target, source.open("rb") as original:
         original.seek(len(file.header))
-        target.write(header + original.read(start - len(file.header)))
-        target.write(rows.data)
+        target.writelines((re.sub(vertex, new, header, count=1), original.read(start - len(file.header)), rows.data))
         original.seek(start + count * kind.itemsize)
         shutil.copyfileobj(original, target)
 
@@ -263,8 +264,7 @@ def has_own_columns(path: Path) -> bool:
 def ply_marks(path: Path) -> Marks:
     """The marks in the header of a .ply; ``OSError`` if it cannot be read."""
     lines = _header(path).decode("utf-8", "replace").splitlines()
-    words = ("comment ", "comment\t", "obj_info")
-    return marks_in([line[8:].strip()[:200] for line in lines if line[:8].lower() in words])
+    return marks_in([line[8:].strip()[:200] for line in lines if re.match(r"(?i)comment\s|obj_info", line)])
 
 
 def marks_in(comments: Sequence[str]) -> Marks:

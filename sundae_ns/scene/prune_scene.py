@@ -266,7 +266,7 @@ class Form(NamedTuple):
     def choices(cls, scene: Scene, suffix: str) -> list[Form]:
         """Forms to choose from, the most exact first: packs have steps, other files a degree of harmonics."""
         degree = scene.gaussians.sh_degree
-        if suffix in (".sundae", ".html"):
+        if suffix in (".sundae", ".html", ""):  # a page may be a folder
             return [cls(degree, power) for power in (0.0, 0.75, 1.5)]
         return [cls(each) for each in sorted({degree, min(degree, 1), 0}, reverse=True)]
 

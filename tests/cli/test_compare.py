@@ -10,6 +10,7 @@ from command_line import refusal, run
 
 import sundae_ns as sn
 from sundae_ns.core.gaussians import bytes_of
+from sundae_ns.io import formats
 from sundae_ns.scene.describe import box_of
 
 
@@ -49,11 +50,16 @@ def test_files_are_compared_with_the_first_one(folder, tmp_path, capsys):
     assert run("compare", *words, "--cameras", folder / "whole.sundae", "--num-cameras", 1, "--min-psnr", 5) == 0
 
 
-def test_formats_of_one_scene_are_one_table(folder, capsys):
-    assert run("compare", folder / "whole.ply", "--formats") == 0
-    rows = {row["scene"]: row for row in rows_of(capsys.readouterr().out)}
-    assert list(rows) == ["whole.ply", "whole.spz", "whole.sog", "whole.glb", "whole.sundae"]
-    assert float(rows["whole.glb"]["PSNR, dB"]) > 90 > float(rows["whole.spz"]["PSNR, dB"]) > 25
+def test_formats_of_one_scene_are_one_table(folder, tmp_path, capsys, monkeypatch):
+    """What cannot hold the scene is left out, and no report names the folder of the files."""
+    monkeypatch.setitem(formats._WRITERS, ".glb", lambda path, *_: sn.load(path))  # which is not there
+    assert run("compare", folder / "whole.ply", "--formats", "-o", tmp_path / "out") == 1
+    said = capsys.readouterr().out
+    rows = {row["scene"]: row for row in rows_of(said)}
+    assert list(rows) == ["whole.ply", "whole.spz", "whole.sog", "whole.sundae"]
+    assert float(rows["whole.sundae"]["PSNR, dB"]) > float(rows["whole.spz"]["PSNR, dB"]) > 25
+    assert "- Left out: whole.glb: whole.glb cannot be read" in said
+    assert {row["source"] for row in json.loads((tmp_path / "out/report.json").read_text())} == {f"{folder}/whole.ply"}
 
 
 COSTS = {
@@ -82,7 +88,7 @@ def test_commands_say_what_a_change_costs(folder, capsys, monkeypatch):
             figures = [float(row[name]) for name in ("MB", "PSNR, dB", "SSIM", "worst, dB")]
             found = re.fullmatch(r"(.*) MB \(of .*\); (.*) dB, (.*) against .*, worst (.*)", said[-1])
             assert [float(value) for value in found.groups()] == pytest.approx(figures, abs=0.051)
-    assert sn.load("b.html").num_gaussians == 150
+    assert (sn.load("b.html").num_gaussians, len(sn.load("e/scene.sundae").cameras)) == (150, 3)
 
 
 def facts_of(path, capsys):

@@ -21,7 +21,7 @@ import sundae_ns as sn
 from sundae_ns.core.gaussians import SPLAT_NAMES
 from sundae_ns.io.formats import read_gaussian_file, write_for_viewers
 from sundae_ns.io.pack.packed_scene import PackedScene, read_scene, write_scene
-from sundae_ns.io.ply import MODEL_FRAME, Marks, ply_marks, read_ply, write_ply
+from sundae_ns.io.ply import Marks, ply_marks, read_ply, write_ply
 from sundae_ns.io.spz import clamped
 from sundae_ns.scene import prune_scene as pruning
 from sundae_ns.scene.scene import from_points
@@ -45,6 +45,9 @@ def test_export_of_a_packed_scene(tmp_path, mode):
     assert all(torch.equal(found[name], truth[name]) for name in SPLAT_NAMES)
     assert ply_marks(tmp_path / "a.ply").in_model_frame
     assert ("SplatRenderMode: mip" in PlyData.read(tmp_path / "a.ply").comments) == (mode == "antialiased")
+    assert run("export", tmp_path / "a.sundae", "-o", tmp_path / "a.spz", "--upright") == 0
+    write_for_viewers(tmp_path / "b.spz", truth, Marks(antialiased=mode == "antialiased"), upright=True)
+    assert (tmp_path / "a.spz").read_bytes() == (tmp_path / "b.spz").read_bytes()
 
 
 @pytest.mark.usefixtures("short_distillation")
@@ -76,13 +79,6 @@ def test_export_of_a_ply_of_any_program(tmp_path, kind, comments, capsys, caplog
     assert out.read_bytes() == same.read_bytes()
     beyond = re.findall(r"clamped scales or colours of (\d+) Gaussians", output)
     assert beyond == ([str(clamped(written))] if kind == ".spz" else [])
-
-
-def test_export_of_a_ply_of_nerfstudio_upright(tmp_path):
-    write_ply(tmp_path / "in.ply", gaussians(), comments=[MODEL_FRAME])
-    assert run("export", tmp_path / "in.ply", "-o", tmp_path / "a.spz", "--upright") == 0
-    write_for_viewers(tmp_path / "b.spz", gaussians(), upright=True)
-    assert (tmp_path / "a.spz").read_bytes() == (tmp_path / "b.spz").read_bytes()
 
 
 @pytest.mark.usefixtures("short_distillation")
@@ -134,17 +130,11 @@ def test_commands_on_files_need_no_nerfstudio_and_a_prune_no_compiler(tmp_path):
     write_scene(tmp_path / "a.sundae", PackedScene(gaussians(), meta={"model": MODEL}))
     write_ply(tmp_path / "few.ply", gaussians(50))
     write_kind(tmp_path / "head.sundae", KINDS["residual"])
-    commands = [
-        "prune few.ply -o fewer.ply --num-cameras 2",
-        "export a.sundae -o a.ply",
-        "export a.ply -o a.spz",
-        "prune a.ply -o pruned.ply --num-cameras 4",
-        "prune a.spz -o pruned.sundae --count 20 --num-cameras 4",
-        "export head.sundae -o head.html",
-        "pack a.ply -o packed.sundae",
-        "pack gone -o x",
-        "export gone -o x.html",
-    ]
+    commands = (
+        "prune few.ply -o fewer.ply --num-cameras 2; export a.sundae -o a.ply; export a.ply -o a.spz; "
+        "prune a.ply -o pruned.ply --num-cameras 4; prune a.spz -o pruned.sundae --count 20 --num-cameras 4; "
+        "export head.sundae -o head.html; pack a.ply -o packed.sundae; pack gone -o x; export gone -o x.html"
+    ).split("; ")
     words = [sys.executable, "-c", WITHOUT, json.dumps(commands)]
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -160,8 +150,7 @@ def test_prune_by_the_cameras_of_files(tmp_path, capsys):
     """Those of a packed scene, of a COLMAP model and of a transforms.json; each says how many it is."""
     scene = sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3))
     sn.save(scene, tmp_path / "a.ply")
-    stored = sn.virtual_cameras(scene, 3, size=32)
-    sn.save(dataclasses.replace(scene, cameras=tuple(stored)), tmp_path / "a.sundae")
+    sn.save(dataclasses.replace(scene, cameras=tuple(sn.virtual_cameras(scene, 3, size=32))), tmp_path / "a.sundae")
     write_model(tmp_path / "sparse", ["a.png", "b.png"], (32, 24))
     frame = {"transform_matrix": [[1, 0, 0, 2.0], [0, 1, 0, 0.5], [0, 0, 1, 3], [0, 0, 0, 1]]}
     frame |= {"fl_x": 30, "fl_y": 30, "cx": 16, "cy": 12, "w": 32, "h": 24}
@@ -173,25 +162,38 @@ def test_prune_by_the_cameras_of_files(tmp_path, capsys):
         seen = re.search(rf"{number} cameras see ([\d.]+)% of the Gaussians(; if the cameras are not in)?", text)
         assert (seen[2] is not None) == (float(seen[1]) < 92) == (name == "transforms.json")
         assert "50 of 200 Gaussians" in text
-    words = ("-o", tmp_path / "transforms.json", "--cameras", tmp_path, "--overwrite")
-    assert run("prune", tmp_path / "a.ply", *words) == 2
+    assert (
+        run("prune", tmp_path / "a.ply", "-o", tmp_path / "transforms.json", "--cameras", tmp_path, "--overwrite") == 2
+    )
 
 
 @pytest.mark.parametrize(("name", "asked"), [("a.ply", 0.1), ("a.spz", 0.02), ("a.sundae", 0.012), ("a.html", 0.25)])
 def test_a_size_that_was_asked_for_binds(name, asked, tmp_path, capsys):
     """With a box, a direction and a page in the same command; if all Gaussians fit, none goes, and a line says so."""
     points = torch.rand(3000, 3, generator=torch.Generator().manual_seed(0))
-    sn.save(sn.Scene.from_points(points, points), tmp_path / "in.ply")
+    sn.save(sn.Scene.from_points(points, points, sh_degree=2), tmp_path / "in.ply")
     words = ["prune", tmp_path / "in.ply", "-o", tmp_path / name, "--num-cameras", "2", "--up", "0", "1", "0"]
     assert run(*words, "--max-mb", asked, "--crop", "0", "0", "0", "1", "1", "0.9") == 0
     size, (kept,) = (tmp_path / name).stat().st_size, re.findall("([0-9,]+) of 3,000", capsys.readouterr().out)
     assert 0.97 * asked <= size / 1e6 <= asked
     assert 100 < int(kept.replace(",", "")) < 2700
+    assert sn.load(tmp_path / name).gaussians.sh_degree == (0 if name in ("a.ply", "a.spz") else 2)
     if name != "a.html":  # whose code takes most of the time, and which is searched for as a .sundae is
         assert run(*words, "--max-mb", "9", "--overwrite") == 0
         said, size = capsys.readouterr(), (tmp_path / name).stat().st_size / 1e6
         assert "3,000 of 3,000" in said.out
         assert f"the whole scene takes {size:.2f} MB, less than was asked for" in said.err
+
+
+def test_a_size_is_that_of_a_page_with_both_scenes_and_all_files(tmp_path, monkeypatch):
+    scene = sn.Scene.from_points(*torch.rand(2, 1000, 3, generator=torch.Generator().manual_seed(0)))
+    sn.save(scene, tmp_path / "a.ply")
+    sn.save(dataclasses.replace(scene[:300], cameras=tuple(sn.virtual_cameras(scene, 3))), tmp_path / "b.sundae")
+    bytes_of = Mock(side_effect=lambda path, one, two, views: path.write_bytes(one[2] + two[2]))
+    monkeypatch.setattr("sundae_ns.cli.export.write_page", bytes_of)
+    words, most = (tmp_path / "a.ply", tmp_path / "b.sundae", "-o", tmp_path / "site"), 15_000
+    assert run("export", *words, "--max-mb", most / 1e6, "--cameras", tmp_path / "b.sundae") == 0
+    assert 0.97 * most <= (tmp_path / "site").stat().st_size <= most
 
 
 @pytest.mark.gpu

@@ -1,7 +1,6 @@
 """What each command refuses: one line with the cause and the remedy, before anything is written or started."""
 
 import dataclasses
-import json
 import shlex
 import sys
 
@@ -57,7 +56,7 @@ REFUSALS = {
     "export in.ply -o a.splat": "name it .ply, .spz, .sog, .glb, .html",
     "export in.ply -o in.bin/new/a.sog": "in.bin is no folder",
     "export in.ply -o a.ply": "in.ply is a .ply already; give an output name that ends in .spz or",
-    "export in.ply -o a.sog --lod": "a.sog is no folder, which levels of detail take",
+    "export in.ply -o a.sog --lod": "name one without a suffix, and leave out --max-mb",
     "export in.ply -o a --lod --start-view 0": "only a page shows two scenes, named views or a start view",
     "export in.ply -o a.sog --upright": "not in nerfstudio's coordinates",
     "export in.sundae -o a.html --upright": "leave out --upright",
@@ -95,10 +94,10 @@ REFUSALS = {
     "render in.sundae -o a.png --view 0 --width 1": "width is 1; give at least 2",
     "render in.sundae -o a.png --view 0 --fps 9": "--fps is of a video",
     "render in.sundae -o a.png --view 0 --seconds 9": "--seconds is the length of a film",
-    "render in.sundae -o a.mp4 --camera few.json --seconds 9": "--seconds is the length of a film",
+    "render in.sundae -o a.png --seconds 9": "--seconds is the length of a film",
     "render in.sundae -o a.mp4 --fps nan": "--fps is of a video",
-    "render in.sundae -o a.png --camera damaged.json": "damaged.json is not JSON",
-    "render in.sundae -o a.png --camera none.json": "none.json",
+    "render in.sundae -o a.png --cameras damaged.json": "damaged.json is not JSON",
+    "render in.sundae -o a.png --cameras none.json": "none.json",
     "render nothing -o a.png": "nothing does not exist",
     "render in.sundae -o damaged.json/new/a.png": "damaged.json is no folder; choose another",
     "train scene --keep 0": "keep is 0.0",
@@ -134,7 +133,8 @@ REFUSALS = {
     "run photos -o used": "used holds files; choose another folder",
     "run photos -o out --keep 2": "keep is 2.0",
     "run photos -o out --steps 0": "steps is 0",
-    "run photos -o out --max-mb 2 --method sundae-fast": "--max-mb needs a method that decides",
+    "compare in.ply in.sundae --formats": "one scene with itself; leave out in.sundae",
+    "export in.ply -o levels --lod --max-mb 1": "leave out --max-mb",
     "view in.ply --count 0": "count is 0; give at least 1",
     "render in.sundae -o a.png --keep 2": "keep is 2.0",
     "run photos -o out --quality best --method sundae-fast": "--quality best needs a method that",
@@ -156,8 +156,7 @@ def inputs(tmp_path_factory):
     for name, count in (("none.ply", 5), ("empty.ply", 0)):
         nan = b"\xff" * (len(values) // 200 * count)
         (folder / name).write_bytes(header.replace(b"vertex 200", b"vertex %d" % count) + b"end_header\n" + nan)
-    path = {"render_width": 41, "render_height": 31, "camera_path": []}
-    contents = {"in.bin": b"\x1f\x8b\xff", "damaged.json": b"{", "few.json": json.dumps(path).encode()}
+    contents = {"in.bin": b"\x1f\x8b\xff", "damaged.json": b"{"}
     contents |= dict.fromkeys(
         ("a.ksplat", "a.lcc", "a.glb", "a.pth", "a.splat", "page.html", "a.7z", "a.usdz"), bytes(33)
     )

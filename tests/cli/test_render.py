@@ -54,17 +54,21 @@ def test_an_image_of_a_stored_view(folder, tmp_path, index):
     expected = (255 * sn.render(scene, scene.cameras[index]).rgb).round().byte().numpy()
     assert expected.std() > 5
     assert np.array_equal(pixels(out), expected)
+    assert (
+        run(folder / "cloud.ply", "--cameras", folder / "packed.sundae", "-o", out, "--view", index, "--overwrite") == 0
+    )
+    assert np.abs(pixels(out).astype(int) - expected).mean() < 5  # of packing
 
 
 def test_an_image_of_the_camera_in_a_file(folder, tmp_path, capsys):
     lens, out = {"fl_x": 40.0, "fl_y": 40.0, "cx": 20.0, "cy": 15.0, "w": 40, "h": 30}, tmp_path / "a.jpg"
     camera = write_json(tmp_path / "camera.json", **lens, frames=[{"transform_matrix": POSE}])
-    assert run(folder / "cloud.ply", "--camera", camera, "-o", out) == 0
+    assert run(folder / "cloud.ply", "--cameras", camera, "-o", out) == 0
     assert capsys.readouterr().out == f"{out}: 40 x 30 px\n"
     scene = sn.load(folder / "cloud.ply")
     expected = 255 * sn.render(scene, sn.cameras_of(camera, scene)[0]).rgb.numpy()
     assert np.abs(pixels(out) - expected).mean() < 10  # of JPEG
-    assert run(folder / "cloud.ply", "--camera", camera, "-o", tmp_path / "b.png", "--width", 80) == 0
+    assert run(folder / "cloud.ply", "--cameras", camera, "-o", tmp_path / "b.png", "--width", 80) == 0
     assert pixels(tmp_path / "b.png").shape == (60, 80, 3)
     # Without a camera it is seen from the front.
     assert run(folder / "cloud.ply", "-o", tmp_path / "a.webp", "--width", 64) == 0
@@ -74,12 +78,13 @@ def test_an_image_of_the_camera_in_a_file(folder, tmp_path, capsys):
 def test_a_video_has_a_frame_for_each_camera_and_even_sides(folder, tmp_path, capsys):
     out, cameras = tmp_path / "a.mp4", [{"camera_to_world": sum(POSE, []), "fov": 60}] * 5
     size = {"render_width": 41, "render_height": 31}
-    words = (folder / "cloud.ply", "--camera", write_json(tmp_path / "a.json", **size, camera_path=cameras, fps=10))
+    words = (folder / "cloud.ply", "--cameras", write_json(tmp_path / "a.json", **size, camera_path=cameras, fps=10))
     assert run(*words, "-o", out) == 0
     assert capsys.readouterr().out == f"{out}: 5 frames of 40 x 30 px, 0.5 s\n"
     assert [(frame.width, frame.height) for frame in frames_of(out)] == [(40, 30)] * 5
     assert run(*words, "-o", out, "--fps", 5, "--overwrite") == 0
     assert capsys.readouterr().out == f"{out}: 5 frames of 40 x 30 px, 1.0 s\n"
+    assert run(*words, "-o", out, "--seconds", 9, "--overwrite") == 2
 
 
 @pytest.mark.parametrize("name", ["packed.sundae", "cloud.ply"])

@@ -28,6 +28,9 @@ def test_the_printed_command_runs(commands, capsys, method):
     config = config_of(commands.ran[0], method)
     assert (config.data, config.output_dir, config.max_num_iterations) == (Path("scene"), Path("my runs"), 700)
     assert config.pipeline.model.pruning.keep_ratio == 0.05
+    assert train("scene", "--method", method, "--max-mb", "2") == 0
+    most = "--pipeline.model.pruning.max-bytes" in commands.ran[2], commands.ran[-1][-2:]
+    assert most == (method == "sundae", ["--max-mb", "2.0"]), "without trials the pack alone has this size"
 
 
 def test_what_is_not_given_is_the_method_s_own_and_its_run_is_packed(commands, capsys):

@@ -5,6 +5,7 @@ import re
 import shutil
 from statistics import fmean
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -93,15 +94,10 @@ def test_a_run_is_cut_before_it_is_packed_or_exported(tiny, packed, tmp_path, ca
 
 
 def test_levels_of_a_run_are_trained_from_the_cameras_of_its_photos(tiny, packed, tmp_path, monkeypatch):
-    given = []
-
-    def levels_of(scene, cameras, after_step):
-        given.extend(cameras)
-        return [(scene, 30.0)]
-
+    levels_of = Mock(side_effect=lambda scene, *_: [(scene, 30.0)])
     monkeypatch.setattr("sundae_ns.plugin.distill.levels_of", levels_of)
     assert run("export", tiny.folder, "-o", tmp_path / "a", "--lod", "--upright") == 0
-    assert len(given) == len(load(packed).cameras)
+    assert len(levels_of.call_args.args[1]) == len(load(packed).cameras)
     assert load(tmp_path / "a").up == pytest.approx((0, -1, 0), abs=1e-6)
 
 

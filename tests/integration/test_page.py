@@ -478,8 +478,7 @@ def test_controls_have_names_and_loading_a_bar(site):
         assert len(set(values)) > 5
         assert 0.3 < values[-1] < 1
         assert page.evaluate("progress.hidden")
-        nodes = page.call("Accessibility.getFullAXTree")["nodes"]
-        shown = [node for node in nodes if not node.get("ignored")]
+        shown = [node for node in page.call("Accessibility.getFullAXTree")["nodes"] if not node.get("ignored")]
         parts = [(node["role"]["value"], node.get("name", {}).get("value")) for node in shown]
         assert ("application", "3D view of A b/c") in parts
         roles = {"button", "checkbox", "slider", "application", "DisclosureTriangle"}

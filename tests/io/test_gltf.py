@@ -152,8 +152,7 @@ def test_instances_are_nodes_of_their_own(tmp_path):
     write(tmp_path / "b.glb", {**document, "nodes": [{**outer, "children": [1, 2, 3]}, *nodes]}, binary)
     for values in placed.values():
         binary = added(document, binary, np.array(values, "<f4"), 5126)
-    first = len(document["accessors"]) - 3
-    instancing = {"attributes": {name: first + i for i, name in enumerate(placed)}}
+    instancing = {"attributes": {name: len(document["accessors"]) - 3 + i for i, name in enumerate(placed)}}
     document["nodes"] = [{**outer, "mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": instancing}}]
     document["extensionsRequired"] = ["EXT_mesh_gpu_instancing"]
     write(tmp_path / "a.glb", document, binary)

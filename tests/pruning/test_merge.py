@@ -97,8 +97,7 @@ def test_a_merge_keeps_the_weighted_sum_of_colours(edges):
     labels = voronoi_labels(gaussian_graph(params, config), decision.mask)
     total = torch.zeros(300).index_add_(0, labels.clamp_min(0), WEIGHTS * (labels >= 0))[decision.mask]
     found = (total[:, None] * decision.values["features_dc"]).sum(dim=0)
-    expected = (WEIGHTS * (labels >= 0)) @ params["features_dc"]
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(found, (WEIGHTS * (labels >= 0)) @ params["features_dc"], rtol=1e-4, atol=1e-4)
     plain = decide_share(params, draws(edges=edges, redistribution="none"), 0.1, WEIGHTS)
     assert torch.equal(plain.mask, decision.mask), "a merge does not change the selection"
 

@@ -141,8 +141,7 @@ def test_virtual_views_are_the_same_for_a_seed_and_see_the_scene():
 @pytest.mark.parametrize("factor", [1e-3, 1e6])
 def test_a_scene_of_any_size_is_pruned_alike(factor):
     """The near plane is 0.01 world units away, which is more than the whole of a small scene."""
-    moved = sn.transform(scene(), scale=factor)
-    own, other = (prune_with_mask(each, 0.3) for each in (scene(), moved))
+    own, other = (prune_with_mask(each, 0.3) for each in (scene(), sn.transform(scene(), scale=factor)))
     assert other.seen_share == own.seen_share
     assert (own.mask == other.mask).float().mean() > 0.95
 

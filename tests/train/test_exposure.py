@@ -143,8 +143,7 @@ def test_ranks_add_up_what_each_has_measured():
 
 
 def test_cameras_at_one_place_are_apart_by_what_they_see():
-    eye = torch.zeros(3)
-    cameras = [Camera.look_at(eye, (math.cos(a), math.sin(a), 0.0)) for a in ANGLES]
+    cameras = [Camera.look_at(torch.zeros(3), (math.cos(a), math.sin(a), 0.0)) for a in ANGLES]
     cameras += [Camera.look_at((4.0, 0.0, 0.0), (9.0, 0.0, 0.0))]
     apart = np.linalg.norm(view_points(cameras)[:-1].diff(dim=0).numpy(), axis=1)
     assert apart == pytest.approx(apart[0], rel=1e-3)

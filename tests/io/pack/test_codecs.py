@@ -57,8 +57,7 @@ def test_positions(kind, n, seed):
     assert sorted(order) == list(range(n))
     found = module.dequantize_positions(packed, bits, size).astype(np.float64)
     half = (packed.high.astype(np.float64) - packed.low) / (2**bits - 1) / 2
-    block = np.arange(n) // size
-    assert (np.abs(found - x[order]) <= half[block] * (1 + 1e-9) + ulp(x[order])).all()
+    assert (np.abs(found - x[order]) <= half[np.arange(n) // size] * (1 + 1e-9) + ulp(x[order])).all()
     assert ((packed.codes[1:] >= packed.codes[:-1]) | (np.arange(1, n) % size == 0)).all()
     assert (packed.codes < np.uint64(1 << 3 * bits)).all()
 
