@@ -40,9 +40,9 @@ from sundae_ns.train.progress import warn
 
 Array = NDArray[np.float64]
 
-TYPES = {name: CAMERA_MODEL_TO_TYPE[name].value for name in KINDS}
-"""nerfstudio's camera type of each kind of lens."""
+TYPES = {name: CAMERA_MODEL_TO_TYPE[name].value for name in KINDS}  # nerfstudio's camera type of each kind of lens
 STRAY = 10.0  # A camera is stray if it stands more than this many times as far from the middle as the others
+FAR = 20.0  # Times the median distance beyond which cameras are warned of where too many are far away to be stray
 FINE_STEP, COARSE_STEP = 1e-5, 1e-3
 """Steps of float32 at the cameras, as shares of their distances: coordinates are shifted from the first one on, and
 cannot be used from the second one on."""
@@ -365,8 +365,8 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
     sizes = torch.cat([cameras.width, cameras.height], dim=1).clamp_min(1)
     centre, focal = torch.cat([cameras.cx, cameras.cy], dim=1), cameras.fx[:, 0] / sizes[:, 0]
     # Views of 178 and of 0.06 degrees; principal points far outside, or as shares of the image.
-    far = (centre / sizes - 0.5).abs().amax(dim=1) > 1.5
-    strange = (focal < 0.01) | (focal > 1000) | far | ((centre.amax(dim=1) <= 1) & (sizes.amin(dim=1) > 8))
+    outside = (centre / sizes - 0.5).abs().amax(dim=1) > 1.5
+    strange = (focal < 0.01) | (focal > 1000) | outside | ((centre.amax(dim=1) <= 1) & (sizes.amin(dim=1) > 8))
     if strange.any():
         w, fl_x, cx, cy = torch.cat([sizes[:, :1], cameras.fx, centre], dim=1)[strange][0].tolist()
         values = f"fl_x {fl_x:.3g}, cx {cx:.3g}, cy {cy:.3g} at a width of {w:.0f} px"
@@ -383,7 +383,7 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
     cloud = centres[:0] if points is None else points.cpu()
     far = torch.from_numpy(stray_cameras(centres.double().numpy(), lambda: cloud.double().numpy()))
     if not far.any() and usual > 0:
-        far = distances > 20 * usual
+        far = distances > FAR * usual
         if len(cloud):
             far &= distances > STRAY * float((cloud.double() - middle).norm(dim=1).median())
     if far.any():
