@@ -64,14 +64,14 @@ class GsplatBackend:
             absgrad=absgrad,
         )
 
-    def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
+    def spherical_harmonics(self, degree: int, directions: Tensor, first: Tensor, rest: Tensor) -> Tensor:
         """See :meth:`.Backend.spherical_harmonics`."""
         from gsplat import spherical_harmonics
 
         check_kernels_take(directions)
         if directions.shape[0] == 0:
-            return ReferenceBackend().spherical_harmonics(degree, directions, coeffs)
-        return spherical_harmonics(degree, directions, coeffs)
+            return ReferenceBackend().spherical_harmonics(degree, directions, first, rest)
+        return spherical_harmonics(degree, directions, torch.cat([first[:, None], rest], dim=1))
 
 
 class RecordableGsplat(GsplatBackend):

@@ -68,25 +68,25 @@ def each_view(function: Callable[[Any], T], views: Iterable[Any], *, two_at_once
         yield from (pool.map if two_at_once else map)(function, views)
 
 
-def spherical_harmonics(degree: int, directions: Tensor, coeffs: Tensor, *, backend: Backend) -> Tensor:
+def spherical_harmonics(degree: int, directions: Tensor, first: Tensor, rest: Tensor, *, backend: Backend) -> Tensor:
     """Evaluate real spherical harmonics up to ``degree``: the raw sum ``[N, 3]``, without the 0.5 that colours add.
 
     ``directions`` ``[N, 3]``, of any length, lead from the camera to the Gaussian; zero vectors are taken as +z,
-    without gradient. ``coeffs`` ``[N, K, 3]`` have the order and the signs of 3DGS; only the first ``(degree + 1) **
-    2`` are read. ``DataError`` for a degree outside of 0 to 4, or a wrong shape.
+    without gradient. Coefficients ``[N, 3]``, ``[N, K - 1, 3]`` have the order and the signs of 3DGS; only the
+    first ``(degree + 1) ** 2`` are read. ``DataError`` for a degree outside of 0 to 4, or a wrong shape.
     """
     if not 0 <= degree <= MAX_SH_DEGREE:
         raise DataError(f"spherical harmonics of degree {degree} are unknown; use 0 to {MAX_SH_DEGREE}")
     n = directions.shape[0]
-    _check_shapes((directions, "directions", (n, 3)))
-    needed = (degree + 1) ** 2
-    if coeffs.dim() != 3 or coeffs.shape[0] != n or coeffs.shape[1] < needed or coeffs.shape[2] != 3:
-        raise DataError(f"coeffs has shape {list(coeffs.shape)}; degree {degree} needs [{n}, {needed} or more, 3]")
-    _check_alike("directions", directions, coeffs=coeffs)
+    _check_shapes((directions, "directions", (n, 3)), (first, "first", (n, 3)))
+    needed = (degree + 1) ** 2 - 1
+    if rest.dim() != 3 or rest.shape[0] != n or rest.shape[1] < needed or rest.shape[2] != 3:
+        raise DataError(f"rest has shape {list(rest.shape)}; degree {degree} needs [{n}, {needed} or more, 3]")
+    _check_alike("directions", directions, first=first, rest=rest)
     # Replace them here: gsplat's kernel returns NaN where the camera is at a Gaussian's centre.
     is_zero = (directions == 0).all(dim=-1, keepdim=True)
     ahead = constant((0.0, 0.0, 1.0), directions.dtype, directions.device)
-    return backend.spherical_harmonics(degree, torch.where(is_zero, ahead, directions), coeffs)
+    return backend.spherical_harmonics(degree, torch.where(is_zero, ahead, directions), first, rest)
 
 
 def harmonic_colors(
@@ -101,8 +101,7 @@ def harmonic_colors(
     if isinstance(backend, RecordableGsplat) and len(means):
         check_kernels_take(means)
         return cast("Tensor", gsplat_kernels.harmonic_colors(degree, means, center, features_dc, features_rest))
-    coeffs = torch.cat([features_dc[:, None], features_rest], dim=1)
-    return (spherical_harmonics(degree, means - center, coeffs, backend=backend) + 0.5).clamp_min(0)
+    return (spherical_harmonics(degree, means - center, features_dc, features_rest, backend=backend) + 0.5).clamp_min(0)
 
 
 def blending_weights(inputs: Inputs, pixels: Tensor | None = None, *, backend: Backend) -> Tensor:
@@ -194,7 +193,7 @@ def _kernel_problem() -> str | None:
     """Run gsplat's smallest kernel; the cause and remedy if it fails, else None."""
     try:
         ones = torch.ones(1, 1, 3, dtype=torch.float32, device="cuda")
-        GsplatBackend().spherical_harmonics(0, ones[0], ones).sum().item()
+        GsplatBackend().spherical_harmonics(0, ones[0], ones[0], ones[:, 1:]).sum().item()
     except ImportError as error:
         return f"gsplat does not import ({one_line(error)}); install gsplat"
     except Exception as error:  # a failed build or a missing kernel image raises errors of many kinds

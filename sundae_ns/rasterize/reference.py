@@ -47,10 +47,10 @@ class ReferenceBackend:
         image, alpha = composite(means2d, projection, opacities, colors, size, absgrad=inputs.absgrad)
         return result_of(image, alpha, means2d, projection.radii, inputs)
 
-    def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
+    def spherical_harmonics(self, degree: int, directions: Tensor, first: Tensor, rest: Tensor) -> Tensor:
         """See :meth:`.Backend.spherical_harmonics`."""
         basis = harmonic_basis(degree, normalize(directions, dim=-1))
-        return (basis[..., None] * coeffs[:, : basis.shape[-1]]).sum(dim=-2)
+        return (basis[..., None] * torch.cat([first[:, None], rest], dim=1)[:, : basis.shape[-1]]).sum(dim=-2)
 
 
 # ---------------------------------------------------------------------------------------------------------- projection

@@ -63,8 +63,8 @@ class Backend(Protocol):
     def rasterize(self, inputs: Inputs) -> Rasterization:
         """Render one view."""
 
-    def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
-        """Sum of harmonics ``[N, 3]`` for directions ``[N, 3]`` (not zero) and coefficients ``[N, K, 3]``."""
+    def spherical_harmonics(self, degree: int, directions: Tensor, first: Tensor, rest: Tensor) -> Tensor:
+        """Sum ``[N, 3]`` for directions ``[N, 3]`` (not zero) and coefficients ``[N, 3]``, ``[N, K - 1, 3]``."""
 
 
 def result_of(image: Tensor, alpha: Tensor, means2d: Tensor, radii: Tensor, inputs: Inputs) -> Rasterization:

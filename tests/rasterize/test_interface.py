@@ -73,7 +73,7 @@ def views(**changes):
 
 
 def harmonics(degree, terms):
-    return spherical_harmonics(degree, torch.ones(2, 3), torch.ones(2, terms, 3), backend=REFERENCE)
+    return spherical_harmonics(degree, *torch.ones(2, 2, 3).unbind(), torch.ones(2, terms - 1, 3), backend=REFERENCE)
 
 
 REFUSED = [

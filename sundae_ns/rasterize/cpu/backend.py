@@ -47,12 +47,12 @@ class CpuBackend:
         image, alpha = composite(means2d, projection.conics, opacities, colors, size, lists, inputs.absgrad)
         return result_of(image, alpha, means2d, projection.radii, inputs)
 
-    def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
+    def spherical_harmonics(self, degree: int, directions: Tensor, first: Tensor, rest: Tensor) -> Tensor:
         """See :meth:`.Backend.spherical_harmonics`."""
         _check(directions)
         outputs = (torch.empty_like(directions, memory_format=torch.contiguous_format),)
-        loops = _evaluate, _evaluate_backward, MIN_PER_THREAD
-        return cast("Tensor", _Loops.apply(loops, degree, outputs, 1, directions, coeffs)[0])
+        loops, options = (_evaluate, _evaluate_backward, MIN_PER_THREAD), (degree, rest.shape[1] * rest.requires_grad)
+        return cast("Tensor", _Loops.apply(loops, options, outputs, 1, directions, first, rest)[0])
 
 
 def _check(tensor: Tensor) -> None:
@@ -283,42 +283,43 @@ def _project_backward(
 
 
 @compiled
-def _evaluate(begin: int, end: int, degree: int, directions: Any, coeffs: Any, outputs: Any) -> None:
-    (colors,) = outputs
+def _evaluate(begin: int, end: int, options: Any, directions: Any, first: Any, rest: Any, outputs: Any) -> None:
+    (degree, _), (colors,) = options, outputs
     basis = np.empty(_TERMS)
-    terms = (degree + 1) ** 2
     for i in range(begin, end):
         x, y, z, _ = _unit(directions, i)
         _write_basis(degree, x, y, z, basis)
-        red = green = blue = 0.0
-        for k in range(terms):
-            red += basis[k] * coeffs[i, k, 0]
-            green += basis[k] * coeffs[i, k, 1]
-            blue += basis[k] * coeffs[i, k, 2]
+        red, green, blue = basis[0] * first[i, 0], basis[0] * first[i, 1], basis[0] * first[i, 2]
+        for k in range((degree + 1) ** 2 - 1):
+            red += basis[k + 1] * rest[i, k, 0]
+            green += basis[k + 1] * rest[i, k, 1]
+            blue += basis[k + 1] * rest[i, k, 2]
         colors[i, 0], colors[i, 1], colors[i, 2] = red, green, blue
 
 
 @compiled
 def _evaluate_backward(
-    begin: int, end: int, degree: int, directions: Any, coeffs: Any, gradients: Any, outputs: Any
+    begin: int, end: int, options: Any, directions: Any, first: Any, rest: Any, gradients: Any, outputs: Any
 ) -> None:
-    (grad_colors,) = gradients
-    grad_directions, grad_coeffs = outputs
+    (degree, wanted), (grad_colors,) = options, gradients
+    grad_directions, grad_first, grad_rest = outputs
     basis, gains = np.empty(_TERMS), np.empty(_TERMS)
     terms = (degree + 1) ** 2
     for i in range(begin, end):
         red, green, blue = float(grad_colors[i, 0]), float(grad_colors[i, 1]), float(grad_colors[i, 2])
         if red == 0 and green == 0 and blue == 0:
-            grad_directions[i], grad_coeffs[i] = 0, 0
+            grad_directions[i], grad_first[i], grad_rest[i, :wanted] = 0, 0, 0
             continue
         x, y, z, length = _unit(directions, i)
         _write_basis(degree, x, y, z, basis)
-        for k in range(terms):
-            gains[k] = red * coeffs[i, k, 0] + green * coeffs[i, k, 1] + blue * coeffs[i, k, 2]
-            grad_coeffs[i, k, 0] = red * basis[k]
-            grad_coeffs[i, k, 1] = green * basis[k]
-            grad_coeffs[i, k, 2] = blue * basis[k]
-        grad_coeffs[i, terms:] = 0
+        grad_first[i, 0], grad_first[i, 1], grad_first[i, 2] = red * basis[0], green * basis[0], blue * basis[0]
+        for k in range(terms - 1):
+            gains[k + 1] = red * rest[i, k, 0] + green * rest[i, k, 1] + blue * rest[i, k, 2]
+            if wanted:
+                grad_rest[i, k, 0] = red * basis[k + 1]
+                grad_rest[i, k, 1] = green * basis[k + 1]
+                grad_rest[i, k, 2] = blue * basis[k + 1]
+        grad_rest[i, terms - 1 : wanted] = 0
         grad_x, grad_y, grad_z = _slope(degree, x, y, z, gains)
         # Only the part across the direction turns it.
         radial = x * grad_x + y * grad_y + z * grad_z if length > _SHORTEST else 0.0
