@@ -137,8 +137,7 @@ def _open_newest(folder: Path) -> tuple[Path, BinaryIO, list[str]]:
                     file = stack.enter_context(regular(path).open("rb"))
                     check_whole(file)
                 except (OSError, ValueError) as error:
-                    reason = getattr(error, "strerror", None) or one_line(error)
-                    skipped.append(f"{path.name} is not whole ({reason})")
+                    skipped.append(f"{path.name} is not whole ({getattr(error, 'strerror', None) or one_line(error)})")
                 else:
                     stack.pop_all()
                     return path, file, skipped

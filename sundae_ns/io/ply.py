@@ -328,8 +328,7 @@ def read_ply(path: Path) -> dict[str, Tensor]:
     if present.issuperset(_RGB) and not present & set(_COLUMNS["features_dc"]):
         columns["features_dc"] = _RGB
     missing = [name for names in columns.values() for name in names if name not in present]
-    foreign = list(_FOREIGN.items())[: None if set(columns["features_dc"]) & set(missing) else -1]
-    for pattern, reason in foreign:
+    for pattern, reason in list(_FOREIGN.items())[: None if set(columns["features_dc"]) & set(missing) else -1]:
         if known := sorted(name for name in present.union(file.elements) if re.fullmatch(pattern, name)):
             raise DataError(f"{path} {reason.format(known[0])}")
     is_flat = missing == ["scale_2"]  # 2D Gaussians
@@ -407,8 +406,7 @@ def _ratios(words: NDArray[Any], bits: tuple[int, ...]) -> NDArray[np.float32]:
     """Fields of 32-bit words, from the top bit down, relative to their largest value ``[N, len(bits)]``."""
     shifts = (32 - np.cumsum(bits)).astype(np.uint32)
     largest = ((1 << np.array(bits)) - 1).astype(np.uint32)
-    levels = (words.astype(np.uint32)[:, None] >> shifts) & largest
-    return levels.astype(np.float32) / largest.astype(np.float32)
+    return ((words.astype(np.uint32)[:, None] >> shifts) & largest).astype(np.float32) / largest.astype(np.float32)
 
 
 def from_smallest_three(others: NDArray[Any], largest: NDArray[Any]) -> NDArray[Any]:

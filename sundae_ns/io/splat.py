@@ -73,8 +73,7 @@ def read_splat(path: Path) -> dict[str, Tensor]:
         rows = np.frombuffer(content := regular(path).read_bytes(), _SPLAT)
         if (content.isascii() and content) or (rows["widths"] < 0).any():
             raise ValueError("it is text, or has negative widths")
-    quats = (rows["quats"].astype(np.float32) - 128) / 128
-    return _gaussians(rows, rows["means"], quats, np.zeros((len(rows), 0, 3)))
+    return _gaussians(rows, rows["means"], (rows["quats"].astype(np.float32) - 128) / 128, np.zeros((len(rows), 0, 3)))
 
 
 def read_ksplat(path: Path) -> dict[str, Tensor]:

@@ -255,8 +255,7 @@ def test_one_command_works_in_a_folder(commands, capsys, monkeypatch):
     run_folder.reserve(Path("out"))
     (other,) = run_folder._held.values()
     monkeypatch.setattr(run_folder, "_held", {})  # as if another process had reserved it
-    line = refusal(capsys, *OUT)
-    assert line.endswith(f"works in {Path('out').resolve()}; wait for it, or choose another folder")
+    assert refusal(capsys, *OUT).endswith(f"works in {Path('out').resolve()}; wait for it, or choose another folder")
     assert commands.ran == []
     other.close()
     # The other ended before it wrote its settings.

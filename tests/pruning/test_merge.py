@@ -180,8 +180,7 @@ def test_equal_pairs_merge_many_at_once_and_all_at_one_place_or_with_one_that_ov
 
 def test_of_islands_the_heaviest_stay():
     gaussians = row(*(1e6 * island + step for island in range(4) for step in range(20)))
-    weight = torch.tensor([1.0, 4.0, 2.0, 3.0]).repeat_interleave(20)
-    labels = pair_labels(gaussians, graph_of(gaussians), weight, 2)
+    labels = pair_labels(gaussians, graph_of(gaussians), torch.tensor([1.0, 4.0, 2.0, 3.0]).repeat_interleave(20), 2)
     assert (labels[labels >= 0].unique() // 20).tolist() == [1, 3]
     assert (labels[:20] == -1).all()
     assert (labels[20:40] >= 0).all()

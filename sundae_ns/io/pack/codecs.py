@@ -393,7 +393,13 @@ def fit_codecs(
     names = [name for name in (*SPLAT_NAMES, FEATURES) if name in gaussians]
     values = {name: as_matrix(gaussians[name]) for name in names}
     order = scene_order(values["means"])
-    blocks, within = quantize_positions(values["means"][order], config.position_bits, config.block)
+    while True:
+        blocks, within = quantize_positions(values["means"][order], config.position_bits, config.block)
+        grid = (blocks.high / 2**config.position_bits - blocks.low / 2**config.position_bits).max(axis=1)
+        widths = np.exp(values["scales"].max(axis=1).clip(max=80))[order[within]]
+        if (grid[np.arange(len(order)) // config.block] > 3 * widths).mean() < 1e-3 or config.block <= 16:
+            break
+        config = replace(config, block=max(config.block // 4, 16))  # what lies far away makes its whole block coarse
     order = order[within]
     values = {name: value[order] for name, value in values.items()}
     values["means"] = dequantize_positions(blocks, config.position_bits, config.block)

@@ -195,8 +195,7 @@ def encode(meta: Mapping[str, Any], arrays: Mapping[str, Array], *, unpacked: in
     little = {name: array.astype(array.dtype.newbyteorder("<"), copy=False) for name, array in arrays.items()}
     parts = {name: [_deflated(plane) for plane in split_planes(array)] for name, array in little.items()}
     body = sum(len(part) for planes in parts.values() for part in planes)
-    size = max(unpacked, sum(array.nbytes for array in little.values()))
-    if (lacking := (size - SPARE) // MAX_RATIO + 1 - body) > 0:
+    if (lacking := (max(unpacked, sum(array.nbytes for array in little.values())) - SPARE) // MAX_RATIO + 1 - body) > 0:
         little[PADDING] = np.zeros(lacking, np.uint8)
         parts[PADDING] = [little[PADDING].tobytes()]
     stored = {name: b"".join(planes) for name, planes in parts.items()}
@@ -283,8 +282,7 @@ def read_sections(path: Path, header: Header) -> dict[str, Array]:
                 planes.append(_inflated(content[start : start + part], section.size // len(section.parts)))
                 start += part
             table = np.frombuffer(b"".join(planes), np.uint8).reshape(_rows(section.shape), section.dtype.itemsize, -1)
-            numbers = np.ascontiguousarray(table.transpose(0, 2, 1))
-            return numbers.reshape(-1).view(section.dtype).reshape(section.shape)
+            return np.ascontiguousarray(table.transpose(0, 2, 1)).reshape(-1).view(section.dtype).reshape(section.shape)
 
         with ThreadPoolExecutor(2) as pool:
             arrays = dict(zip(header.sections, pool.map(decode, header.sections.values()), strict=True))

@@ -232,8 +232,7 @@ def read_scene(path: Path) -> PackedScene:
         n, attributes = int(header.meta["primitives"]), header.meta["attributes"]
         width, features = (int(attributes.get(name, {"width": 0})["width"]) for name in ("features_rest", FEATURES))
         afford(4 * n * (14 + width + features), header.size, SPARE, MAX_RATIO)
-        file = _Sections(header.size, header.meta, container.read_sections(path, header))
-        return _decoded(file, n, width, features)
+        return _decoded(_Sections(header.size, header.meta, container.read_sections(path, header)), n, width, features)
 
 
 def _decoded(file: _Sections, n: int, width: int, features: int) -> PackedScene:

@@ -67,8 +67,7 @@ def test_a_far_primitive_does_not_increase_the_error_of_others():
     x[3] = 1e6
     packed, order = module.quantize_positions(x[coordinates.scene_order(x)], 16, 1024)
     found = module.dequantize_positions(packed, 16, 1024)
-    truth = x[coordinates.scene_order(x)][order]
-    assert np.quantile(np.abs(found - truth).max(axis=1), 0.79) < 1 / 65535 / 2 + 1e-7
+    assert np.quantile(np.abs(found - x[coordinates.scene_order(x)][order]).max(axis=1), 0.79) < 1 / 65535 / 2 + 1e-7
 
 
 def angles(a, b):
@@ -150,6 +149,13 @@ def test_transform(kind, n, seed):
     assert codec.bound < codec.step / 2 * 3.2
     if np.abs(x).max() < 1000:
         assert codec.step == 0.03
+
+
+def test_one_that_is_far_away_leaves_all_others_in_their_place():
+    field = random_field(3000, degree=0)
+    far = {**field, "means": field["means"].index_fill(0, torch.tensor([1500]), 1e6)}
+    found = module.fit_codecs(far, {}, PackConfig())[0]["means"]
+    assert (torch.cdist(field["means"], found).amin(dim=1) > 0.01).sum() < 16
 
 
 @pytest.mark.parametrize("kind", ["normal", "outliers"])
