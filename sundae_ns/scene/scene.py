@@ -55,6 +55,7 @@ class Scene:
     """Whether coordinates are those of nerfstudio's model; otherwise of a capture or of another program."""
     meta: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """JSON values that a packed scene carries along: ``frame``, ``capture``, ``source``."""
+    __iter__ = None  # a scene is no list of Gaussians, nor of scenes
 
     @fitting()
     def __post_init__(self) -> None:
@@ -188,8 +189,7 @@ class Scene:
         rows = np.array(frame.get("transform", np.zeros((3, 4))), np.float64)[:3]
         if frame.get("scale") != 1 or not np.array_equal(rows[:, :3], np.eye(3)):
             return None
-        x, y, z = (-rows[:, 3]).tolist()
-        return x, y, z
+        return tuple((-rows[:, 3]).tolist())
 
     @property
     def device(self) -> torch.device:

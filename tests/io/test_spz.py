@@ -51,12 +51,8 @@ def test_stated_axes_are_turned_to_those_of_a_ply(tmp_path, version, axes):
     plain = read_spz(tmp_path / "a.spz")[0]
     (tmp_path / "a.spz").write_bytes(spz(truth, version, axes=AXES[axes]))
     found = read_spz(tmp_path / "a.spz")[0]
-    rows = {"R": (0, 1), "L": (0, -1), "D": (1, 1), "U": (1, -1), "F": (2, 1), "B": (2, -1)}
-    turn = torch.zeros(3, 3)
-    for column, letter in enumerate(axes):
-        row, sign = rows[letter]
-        turn[row, column] = sign
-    assert_moved(found, plain, turn)
+    ways = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
+    assert_moved(found, plain, torch.tensor([ways[letter] for letter in axes], dtype=torch.float32).T)
 
 
 def _with_stream(content, size):

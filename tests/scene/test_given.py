@@ -123,6 +123,7 @@ REFUSED = {
     "no values": (lambda: SCENE.to("meta"), "are on meta; move them to one that holds values"),
     "nothing": (lambda: sn.Scene({n: v[:0] for n, v in random_field(9).items()}), "no Gaussians"),
     "head": (lambda: dataclasses.replace(SCENE, head=CompensationHead(HeadConfig(size="tiny"))), "the head reads"),
+    "one scene": (lambda: sn.merge(SCENE), "'Scene' object is not iterable"),
     "background": (lambda: dataclasses.replace(SCENE, background_color="grey"), "the background is 'grey'"),
     "up": (lambda: dataclasses.replace(SCENE, up=(0, 0, 0)), "no direction"),
     "device": (lambda: SCENE.to("gpu"), "the device gpu is not available"),
