@@ -73,9 +73,8 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
         covariance = covariances(of("scales", rows).exp(), of("quats", rows)) + spread[:, :, None] * spread[:, None, :]
         return normalized[rows, None, None] * covariance
 
-    covariance = total(moments, 3, 3)
     # A covariance that overflows has no finite widths, so its Gaussian stays unchanged.
-    deviations, quats = scales_and_quaternions(covariance)
+    deviations, quats = scales_and_quaternions(total(moments, 3, 3))
     # A width of zero has no logarithm; limit each axis to the thinnest axis of the members.
     thinnest = torch.full_like(largest, torch.inf)
     for rows in chunks(len(members)):
@@ -88,8 +87,7 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
 
     merged = {name: mean(name) for name in source if name not in ("means", "scales", "quats", "opacities")}
     merged |= {"means": origin + shift, "scales": deviations.log(), "quats": quats}
-    depth = total(cover) / mean_projected_area(deviations)
-    depth = depth.clamp(torch.finfo(depth.dtype).tiny, -math.log1p(-MAX_OPACITY))
+    depth = (total(cover) / mean_projected_area(deviations)).clamp(torch.finfo(w.dtype).tiny, -math.log1p(-MAX_OPACITY))
     merged["opacities"] = (depth + torch.log(-torch.expm1(-depth)))[:, None]  # logit of 1 - exp(-depth)
     changed = (torch.bincount(group, minlength=count) > 1) & (largest > 0)
     for value in merged.values():

@@ -49,8 +49,7 @@ def test_adam_follows_torch():
     for count in range(1, 30):
         gradient, rate = torch.randn(n) * scales, 0.01 / count
         step += 1
-        update = adam.Update(value, gradient, mean, square, step)
-        adam.adam(update, torch.tensor(rate), None, betas=betas, eps=1e-15)
+        adam.adam(adam.Update(value, gradient, mean, square, step), torch.tensor(rate), None, betas=betas, eps=1e-15)
         optimizer.param_groups[0]["lr"], exact.grad = rate, gradient.double()
         optimizer.step()
     torch.testing.assert_close(value.double(), exact.detach(), rtol=0, atol=2e-6)

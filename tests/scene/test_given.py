@@ -93,6 +93,7 @@ def test_cameras_and_numbers_of_every_type():
     turns = np.random.default_rng(0).normal(size=(100, 4))
     for factor in (1e-30, 1e30):
         torch.testing.assert_close(arrays(quats=factor * turns).quats, arrays(quats=turns).quats)
+        torch.testing.assert_close(sn.Scene({**params, "quats": factor * turns}).quats, arrays(quats=turns).quats)
     for eye in ((0, 0, 2), (0, 0, -2), (-2, 0, 0)):
         rotation = look_at(eye, (0, 0, 0), eye).viewmat[:3, :3]
         torch.testing.assert_close(rotation @ rotation.T, torch.eye(3))
