@@ -74,7 +74,7 @@ def check_installed() -> None:
 def threads() -> int:
     """Number of threads: that of the machine's processors, or ``OMP_NUM_THREADS``."""
     stated = os.environ.get("OMP_NUM_THREADS", "")
-    return int(stated) if stated.isdigit() and int(stated) > 0 else (os.cpu_count() or 1)
+    return int(stated) if stated.isdecimal() and int(stated) > 0 else (os.cpu_count() or 1)
 
 
 def find_poses(request: Request, report: Reporter, warn: Callable[[str], object] = print) -> Placed:

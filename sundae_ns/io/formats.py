@@ -181,8 +181,7 @@ def write_for_viewers(
     Drops Gaussians without a meaning (``gaussians.sanitise``), and SH coefficients above the format's degree. ``marks``
     are stated as far as the format can. ``upright`` rotates from nerfstudio's axes to those of a 3DGS .ply, which
     viewers show upright; a .glb always is. Returns the Gaussians of the file, on the CPU, before its format rounds
-    them. ``DataError`` for wrong shapes or what the format cannot store; ``StorageError`` if the disk is full or not
-    writable.
+    them. ``DataError`` for wrong shapes or what the format cannot store; ``StorageError`` if it cannot be written.
     """
     kind = path.suffix.lower()
     gaussians, marks = _prepared(params, kind, marks or Marks(), upright)
@@ -202,8 +201,9 @@ def _prepared(params: Mapping[str, Tensor], kind: str, marks: Marks, upright: bo
     gaussians = {name: value.detach().cpu() for name, value in sanitise(params).gaussians.as_harmonics().items()}
     if upright and kind != ".glb":
         gaussians = similarity(gaussians, UPRIGHT, 1.0)
-        x, y, z = (UPRIGHT[:, :3] @ torch.tensor(marks.up or _MODEL_UP)).tolist()
-        marks = marks._replace(in_model_frame=False, up=(x, y, z))
+        turn, vectors = UPRIGHT[:, :3].double().numpy(), (marks.up or _MODEL_UP, marks.offset)
+        up, offset = (vector and tuple((turn @ vector).tolist()) for vector in vectors)
+        marks = marks._replace(in_model_frame=False, up=up, offset=offset)
     if kind != ".ply":
         gaussians["features_rest"] = gaussians["features_rest"][:, : (MAX_SH_DEGREE + 1) ** 2 - 1]
     return gaussians, marks

@@ -144,7 +144,7 @@ def with_start(scene: Scene, start_view: str | None, up: Sequence[float] | None)
     scene = scene if up is None else dataclasses.replace(scene, up=unit(up))
     if start_view is None:
         return scene
-    if not start_view.lstrip("-").isdigit():
+    if not start_view.removeprefix("-").isdecimal():
         return dataclasses.replace(scene, start=cameras_of(start_view, scene)[0])
     if not 0 <= int(start_view) < len(scene.cameras):
         stored = f"--start-view 0 to {len(scene.cameras) - 1}, or a camera file" if scene.cameras else "a camera file"

@@ -121,7 +121,7 @@ def link_of(view: View, scene: Scene, name: str) -> str:
     stops = max(len(scene.cameras), 1)
     link = f"#camera={view + 1}" if isinstance(view, int) else f"#{view.rpartition('#')[2]}"
     *place, stop = link.removeprefix("#camera=").split(",")
-    if not (link.startswith("#camera=") and len(place) in (0, 6) and stop.isdigit() and 0 < int(stop) <= stops):
+    if not (link.startswith("#camera=") and len(place) in (0, 6) and stop.isdecimal() and 0 < int(stop) <= stops):
         raise ConfigError(f"view {name!r} is {view!r}; give a camera, an index below {stops}, or a link of the page")
     return link
 

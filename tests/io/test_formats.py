@@ -169,9 +169,9 @@ def test_what_cannot_be_loaded_is_not_saved(tmp_path, kind, name):
 
 
 def test_upright_rotates_z_to_minus_y(tmp_path):
-    write_for_viewers(tmp_path / "b.ply", small_field(), upright=True)
+    write_for_viewers(tmp_path / "b.ply", small_field(), Marks(offset=(1.0, 2.0, 3.0)), upright=True)
     sanitised, marks = read_gaussian_file(tmp_path / "b.ply")
-    assert marks == Marks(up=(0.0, -1.0, 0.0))
+    assert marks == Marks(up=(0.0, -1.0, 0.0), offset=(1.0, -3.0, 2.0))
     assert_moved(sanitised.gaussians, small_field(), torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
 
 
