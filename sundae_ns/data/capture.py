@@ -43,7 +43,7 @@ def matrix(value: Any, rows: Sequence[int], name: str, where: str) -> np.ndarray
     """``value`` as a finite, regular float64 matrix ``[R, 4]`` with R one of ``rows``; ``DataError`` if it is none."""
     listed = isinstance(value, list) and len(value) in rows
     if not listed or not all(isinstance(row, list) and len(row) == 4 for row in value):
-        raise DataError(f"{where}: {name} must have {' or '.join(map(str, rows))} rows of 4 numbers")
+        raise DataError(f"{where}: {name} must have {' or '.join(map(str, rows))} rows of 4 numbers; correct the file")
     for entry in chain(*value):
         finite(entry, name, where)
     array = np.array(value, dtype=np.float64)

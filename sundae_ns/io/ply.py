@@ -111,7 +111,7 @@ def checked(path: Path, params: Mapping[str, Tensor]) -> dict[str, Tensor]:
     gaussians = {name: params[name].detach().to("cpu", torch.float32).contiguous() for name in SPLAT_NAMES}
     if not len(gaussians["means"]):
         raise DataError(f"the scene has no Gaussians, which a {path.suffix} cannot store; check the run")
-    if not all(bool(value.isfinite().all()) for value in gaussians.values()):
+    if not all(bool(value.isfinite().all()) for value in (*gaussians.values(), gaussians["scales"].exp())):
         raise DataError("some values are NaN or infinite; drop those Gaussians first (finite_mask)")
     if gaussians["features_rest"].shape[1] > (MAX_SH_DEGREE + 1) ** 2 - 1:
         raise DataError(f"a {path.suffix} stores SH degrees up to {MAX_SH_DEGREE}; cut features_rest, or write a .ply")
