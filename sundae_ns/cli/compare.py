@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import shlex
 import sys
 from dataclasses import replace
@@ -63,8 +62,7 @@ def compare(
     scenes = sorted(scenes, key=lambda path: not is_run(path))  # a run says how photos are read
     photos = cameras is None and (data is not None or any(map(is_run, scenes)))
     if len(scenes) < (1 if photos or formats else 2):
-        given = f"{scenes[0]} is one scene" if scenes else "there is no scene"
-        raise ConfigError(f"{given}; give another, --formats, or --data with a capture")
+        raise ConfigError("a comparison needs two scenes; give another, --formats, or --data with a capture")
     if formats and len(scenes) > 1:
         raise ConfigError(f"--formats compares one scene with itself; leave out {scenes[1]}, or --formats")
     first = None if photos else load(scenes[0]).to(fastest_device())
@@ -119,7 +117,6 @@ def compare(
         files = {"json": json.dumps(rows, indent=1), "csv": csv_text(rows), "md": markdown(groups, notes), "html": page}
         write_files({out / f"report.{kind}": text.encode(errors="backslashreplace") for kind, text in files.items()})
         print(f"wrote {out / 'report.html'}, for a browser ({len(page) / 1e6:.1f} MB), report.md, .csv and .json")
-    least = -math.inf if min_psnr is None else min_psnr
-    if low := [run.label for run in runs if run.full.views and not (run.full.mean("psnr") or 0) >= least]:
-        print(f"below {min_psnr:g} dB: {', '.join(low)}", file=sys.stderr)
+    if low := [run.label for run in runs if run.full.views and not (run.full.mean("psnr") or 0) >= (min_psnr or 0)]:
+        print(f"below {min_psnr or 0:g} dB: {', '.join(low)}", file=sys.stderr)
     return 1 if failures or low else 0
