@@ -157,7 +157,7 @@ class Project:
         try:
             before = json.loads(path.read_bytes())
             changed = [(name, before[name], now) for name, now in settings.items() if before[name] != now]
-        except (ValueError, TypeError, KeyError) as error:
+        except (ValueError, TypeError, KeyError, RecursionError) as error:
             raise StorageError(f"{path} is damaged; choose another folder") from error
         for name, *values in changed:
             first, now = ("left out" if value is None else value for value in values)
@@ -210,7 +210,7 @@ def _passes(check: Callable[[], object]) -> bool:
     """Whether a check of a result is true, and raises no error of ours or of files with other contents."""
     try:
         return check() is not False
-    except (SundaeError, OSError, ValueError, TypeError, KeyError, AttributeError):
+    except (SundaeError, OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError):
         return False
 
 

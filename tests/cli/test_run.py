@@ -111,7 +111,7 @@ def cut(path, size=None):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2 if size is None else size])
 
 
-@pytest.mark.parametrize("figure", ["NaN", '"x"', "Infinity", None])
+@pytest.mark.parametrize("figure", ["NaN", '"x"', "Infinity", "9" * 400, "[" * 99_999, None])
 def test_a_report_without_figures_is_made_again(commands, figure):
     started(commands)
     report = Path("out/report/report.json")
