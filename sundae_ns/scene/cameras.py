@@ -18,6 +18,7 @@ from sundae_ns.core.covariance import rotation_matrices
 from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.data.capture import finite, matrix, read_json, rigid, side
 from sundae_ns.data.colmap import read_images
+from sundae_ns.data.layouts import is_model, models_in
 from sundae_ns.data.lenses import kind_of_frame, with_focal_lengths
 from sundae_ns.scene.scene import Scene, unit
 from sundae_ns.scene.virtual_cameras import FOV, front_views
@@ -38,7 +39,7 @@ def cameras_of(path: Path | str, scene: Scene | None = None) -> list[Camera]:
     """The cameras of a file, as ideal pinhole cameras: distortion is left out.
 
     Args:
-        path: a ``transforms.json``, its folder, a COLMAP model (``sparse/0``), or a camera path of nerfstudio's viewer.
+        path: a ``transforms.json``, a COLMAP model, a folder with one of them, or a camera path of nerfstudio's viewer.
         scene: whose coordinates the cameras get; needed for a run's scene, as training moves and scales its capture.
 
     Raises:
@@ -57,15 +58,13 @@ def cameras_of(path: Path | str, scene: Scene | None = None) -> list[Camera]:
 
 def read_cameras(path: Path, scene: Scene | None = None) -> tuple[list[Camera], float | None]:
     """As :func:`cameras_of`, with the frames per second of a camera path; None for other files."""
-    content: dict[str, Any] = {}
-    if path.is_dir() and any((path / name).exists() for name in ("cameras.bin", "cameras.txt")):
-        entries: Any = list(read_images(path).values())
-    else:
-        path = path / "transforms.json" if path.is_dir() else path
-        content = with_focal_lengths(read_json(path), path.parent)
-        entries = content.get("camera_path", content.get("frames"))
-        if not isinstance(entries, list) or not entries:
-            raise DataError(f"{path} holds neither frames nor a camera_path; give a transforms.json or a camera path")
+    stated = path / "transforms.json" if path.is_dir() else path
+    models = [path] if is_model(path) else [] if stated.exists() else [path / name for name in models_in(path)]
+    path = models[0] if models else stated
+    content: dict[str, Any] = {} if models else with_focal_lengths(read_json(path), path.parent)
+    entries: Any = [*read_images(path).values()] if models else content.get("camera_path", content.get("frames"))
+    if not isinstance(entries, list) or not entries:
+        raise DataError(f"{path} holds neither frames nor a camera_path; give a transforms.json or a camera path")
     if len(entries) > MOST_CAMERAS:
         raise DataError(f"{path.name} has {len(entries):,} cameras; give at most {MOST_CAMERAS:,}")
     read = _of_path if "camera_path" in content else _of_frame if content else _of_colmap

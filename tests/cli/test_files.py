@@ -151,11 +151,11 @@ def test_prune_by_the_cameras_of_files(tmp_path, capsys):
     scene = sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3))
     sn.save(scene, tmp_path / "a.ply")
     sn.save(dataclasses.replace(scene, cameras=tuple(sn.virtual_cameras(scene, 3, size=32))), tmp_path / "a.sundae")
-    write_model(tmp_path / "sparse", ["a.png", "b.png"], (32, 24))
+    write_model(tmp_path / "photos/sparse/0", ["a.png", "b.png"], (32, 24))
     frame = {"transform_matrix": [[1, 0, 0, 2.0], [0, 1, 0, 0.5], [0, 0, 1, 3], [0, 0, 0, 1]]}
     frame |= {"fl_x": 30, "fl_y": 30, "cx": 16, "cy": 12, "w": 32, "h": 24}
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
-    for name, number in (("a.sundae", 3), ("sparse", 2), ("transforms.json", 1)):
+    for name, number in (("a.sundae", 3), ("photos/sparse/0", 2), ("photos", 2), ("transforms.json", 1)):
         arguments = ["prune", tmp_path / "a.ply", "-o", tmp_path / "out.spz", "--cameras", tmp_path / name]
         assert run(*arguments, "--count", "50", "--overwrite") == 0
         text = capsys.readouterr().out
