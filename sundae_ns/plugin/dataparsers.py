@@ -365,12 +365,14 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
     sizes = torch.cat([cameras.width, cameras.height], dim=1).clamp_min(1)
     centre, focal = torch.cat([cameras.cx, cameras.cy], dim=1), cameras.fx[:, 0] / sizes[:, 0]
     # Views of 178 and of 0.06 degrees; principal points far outside, or as shares of the image.
-    outside = (centre / sizes - 0.5).abs().amax(dim=1) > 1.5
-    strange = (focal < 0.01) | (focal > 1000) | outside | ((centre.amax(dim=1) <= 1) & (sizes.amin(dim=1) > 8))
+    aside = (centre / sizes - 0.5).abs()
+    strange = focal.ne(focal.clamp(0.01, 1000)) | (aside.amax(1) > 1.5) | ((centre.amax(1) <= 1) & (sizes.amin(1) > 8))
     if strange.any():
         w, fl_x, cx, cy = torch.cat([sizes[:, :1], cameras.fx, centre], dim=1)[strange][0].tolist()
         values = f"fl_x {fl_x:.3g}, cx {cx:.3g}, cy {cy:.3g} at a width of {w:.0f} px"
         raise DataError(f"{next(compress(names, strange)).name} has {values}, which no lens has; give all in pixels")
+    if (aside.amin(dim=1) > 0.24).all():
+        warn("cx and cy lie far from the middle of all images; if they are of images of another size, scale them")
     if points is not None:
         warn_of_cloud(points, cameras)
     centres = cameras.camera_to_worlds[:, :, 3]
@@ -427,8 +429,7 @@ def warn_of_cloud(points: Tensor, cameras: Cameras) -> None:
     for pose, (fx, fy, cx, cy, width, height) in zip(cameras.camera_to_worlds.cpu(), lenses.tolist(), strict=True):
         x, y, z = ((points - pose[:, 3]) @ pose[:, :3]).unbind(dim=1)
         across, down = (x * fx / -z + cx) / width, (-y * fy / -z + cy) / height
-        inside = (across > -0.1) & (across < 1.1) & (down > -0.1) & (down < 1.1)
-        empty += not ((z < 0) & inside).any()
+        empty += not ((z < 0) & (across > -0.1) & (across < 1.1) & (down > -0.1) & (down < 1.1)).any()
     if empty > 0.5 * len(cameras):
         what = f"{empty} of {len(cameras)} views show no point of the sparse cloud"
         warn(f"{what}: both are probably in different coordinates; export them together, or remove ply_file_path")

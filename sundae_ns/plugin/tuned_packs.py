@@ -147,8 +147,7 @@ class RoundedTraining:
         of_rate: tuple[Tensor | None, ...] = (None,) * len(self.exact)
         if self._rate > 0:
             with torch.enable_grad():
-                bits = estimated_bits(self._codecs, gaussians, head)
-                total = self._rate * torch.stack(list(bits.values())).sum()
+                total = self._rate * torch.stack(list(estimated_bits(self._codecs, gaussians, head).values())).sum()
             of_rate = torch.autograd.grad(total, list(self.exact.values()), allow_unused=True)
         for name, gradient, second in zip(self.exact, gradients, of_rate, strict=True):
             self.set_gradient(name, gradient, second)

@@ -183,6 +183,7 @@ def test_cameras_that_cannot_be(options, cause):
         ({"outlier": 5.0}, None),
         ({"outlier": 100.0}, "the camera of 4.png is .* times as far away as most .1 of 6 are.; check its pose"),
         ({"spread": 0.0}, "all cameras stand at one place"),
+        ({"cx": 20.0, "cy": 16.0}, "cx and cy lie far from the middle of all images; if they are of images of another"),
         ({"outlier": 1e11}, "the camera of 4.png is .* times as far away as most .1 of 6"),
     ],
 )
