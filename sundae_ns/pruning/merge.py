@@ -39,7 +39,9 @@ def gaussian_graph(params: Mapping[str, Tensor], rule: PruneRule) -> NeighborGra
     """
     params = as_gaussians(params).as_harmonics()
     means = params["means"].detach()
-    graph = build_graph(means, num_neighbors=min(rule.num_neighbors, max(len(means) - 1, 1)))
+    # Pairs lose nothing by the nearer half, and take half of the time; merges into cells lose 0.8 dB.
+    wanted = rule.num_neighbors if rule.uses_edge_weights else (rule.num_neighbors + 1) // 2
+    graph = build_graph(means, num_neighbors=min(wanted, max(len(means) - 1, 1)))
     if rule.edges == "centres" or not rule.uses_edge_weights:
         return graph
     # In place: of a large field, each value per edge takes gigabytes.
@@ -71,15 +73,13 @@ def pair_labels(params: Mapping[str, Tensor], graph: NeighborGraph, weight: Tens
     ``weight`` ``[N]`` is not negative. Labels ``[N]`` are as :func:`sundae_ns.core.merging.merge` takes them: the index
     of a member, in each merge that of the heavier group; -1 for Gaussians that are dropped.
     """
-    device, n = graph.indices.device, graph.N
-    values = as_gaussians(params).as_harmonics()
+    device, n, values = graph.indices.device, graph.N, as_gaussians(params).as_harmonics()
     w = weight.to(device).double().nan_to_num(0.0).clamp_min(0)
     label = torch.arange(n, device=device)
     order = torch.sort(w, stable=True).indices
     light = order[w[order].cumsum(0) <= UNSEEN * w.sum()][: n - count]
     label[light] = -1
-    left = n - len(light)
-    if left == count:
+    if (left := n - len(light)) == count:
         return label
 
     groups = _Groups(values, w / w.mean().clamp_min(torch.finfo(torch.float64).tiny) + FLOOR, device)

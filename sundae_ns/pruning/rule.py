@@ -37,7 +37,7 @@ class PruneRule:
     """Whether each dropped Gaussian is merged into the kept one that is nearest along the graph, or of its group
     (merge), or discarded as in the paper (none). A merge needs a pass over the training views."""
     gamma: float = 0.5  # Share of the kept Gaussians that the band selection takes from the high end, in [0, 1]
-    num_neighbors: int = 16  # Most neighbours of a Gaussian in the graph
+    num_neighbors: int = 16  # Most neighbours of a Gaussian in the graph; pairs take the nearer half
     seed: int = 0  # Seed of random draws, which are the same on every device
 
     def __post_init__(self) -> None:

@@ -102,7 +102,7 @@ HARD = {
 
 GOLDEN = {
     "default": ("1a1aa424", [118.709, 138.443]),
-    "pairs": ("31248daf", [134.142, 132.82]),
+    "pairs": ("1a10e0b7", [132.794, 133.502]),
     "drawn by response": ("8b1a3e61", [136.953, 130.25]),
     "merged into a band": ("7fcbc415", [85.066, 145.976]),
     "a function": ("8bcc8dd9", [129.037, 142.88]),
