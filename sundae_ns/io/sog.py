@@ -214,11 +214,11 @@ def _finest_level(path: Path, entry: Entry, size: int) -> tuple[dict[str, Tensor
     if meta.get("environment"):
         files[meta["environment"]] = []
     parts: list[dict[str, Tensor]] = []
-    marks, unpacked = UNMARKED, 0
+    marks = UNMARKED
     for file, leaves in files.items():
-        part, marks = _scene(path, lambda name, file=file: entry(file.removesuffix(META) + name), size)  # type: ignore[misc]
-        unpacked += sum(value.nbytes for value in part.values())
-        afford(unpacked, size)
+        part, stated = _scene(path, lambda name, file=file: entry(file.removesuffix(META) + name), size)  # type: ignore[misc]
+        marks = marks if parts else stated  # those of the scene, not of its environment
+        afford(sum(value.nbytes for each in (*parts, part) for value in each.values()), size)
         rows = torch.full((len(part["means"]),), not leaves)
         for offset, count in leaves:
             if not 0 <= offset <= offset + count <= len(rows) or bool(rows[offset : offset + count].any()):
@@ -227,8 +227,8 @@ def _finest_level(path: Path, entry: Entry, size: int) -> tuple[dict[str, Tensor
         parts.append({name: value[rows] for name, value in part.items()})
     most = max(part["features_rest"].shape[1] for part in parts)
     for part in parts:
-        lacking = most - part["features_rest"].shape[1]
-        part["features_rest"] = torch.nn.functional.pad(part["features_rest"], (0, 0, 0, lacking))
+        rest = part["features_rest"]
+        part["features_rest"] = torch.nn.functional.pad(rest, (0, 0, 0, most - rest.shape[1]))
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}, marks
 
 
@@ -241,14 +241,14 @@ def _file_entry(folder: Path, name: str) -> bytes:
 def _bundled(bundle: zipfile.ZipFile, size: int, *, inner: bool = False) -> tuple[Entry, bool]:
     """What reads an entry of a zip, whose files may be in a folder or in another zip; and whether it is streamed."""
     names = {name: PurePosixPath(name.replace("\\", "/")).name for name in bundle.namelist()}  # some are of Windows
-    streamed = STREAMED in names.values()
-    metas = [name for name, last in names.items() if last == (STREAMED if streamed else META)]
+    main = STREAMED if STREAMED in names.values() else META
+    metas = [name for name, last in names.items() if last == main]
     scenes = [name for name, last in names.items() if last.lower().endswith(".sog") and not last.startswith(".")]
     if len(scenes) == 1 and not metas and not inner:
         return _bundled(zipfile.ZipFile(io.BytesIO(_zip_entry(bundle, size, "", scenes[0]))), size, inner=True)
     if len(metas) != 1:
         raise ValueError(f"it holds {len(metas)} {META} and {len(scenes)} .sog, not one of them; unzip other scenes")
-    return partial(_zip_entry, bundle, size, metas[0].removesuffix(STREAMED if streamed else META)), streamed
+    return partial(_zip_entry, bundle, size, metas[0].removesuffix(main)), main == STREAMED
 
 
 def _zip_entry(bundle: zipfile.ZipFile, size: int, folder: str, name: str) -> bytes:

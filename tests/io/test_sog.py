@@ -342,10 +342,10 @@ def test_levels_of_detail(tmp_path, monkeypatch):
 
 def test_a_zip_with_an_environment(tmp_path, bundled):
     """It belongs to every level, and may have fewer harmonics."""
-    write_sog(tmp_path / "sky.sog", gaussians(30, degree=0))
+    write_sog(tmp_path / "sky.sog", gaussians(30, degree=0), Marks(True))
     sky = {f"env/{name}": data for name, data in entries(tmp_path / "sky.sog").items()}
     make = _streamed((0, 50), (50, 60), more=sky, environment="env/meta.json", version="1")
     (tmp_path / "a.zip").write_bytes(make(bundled))
-    found = read_gaussian_file(tmp_path / "a.zip")[0].gaussians
-    assert found["features_rest"].shape == (140, 15, 3)
-    assert not found["features_rest"][110:].any()
+    found, marks = read_gaussian_file(tmp_path / "a.zip")
+    assert (found.gaussians["features_rest"].shape, marks.antialiased) == ((140, 15, 3), False)
+    assert not found.gaussians["features_rest"][110:].any()
