@@ -78,7 +78,7 @@ def compare(
     measured_by = partial(measure, lpips=lpips, repeats=repeats, command=command)
     with progress_bar() as progress, TemporaryDirectory() as folder:
         if formats:
-            whole = open_run(scenes[0], max_cameras=100, data=data) if is_run(scenes[0]) else load(scenes[0])
+            source = open_run(scenes[0], max_cameras=100, data=data) if is_run(scenes[0]) else load(scenes[0])
             others = (other for other in (*FORMATS, ".sundae") if other != scenes[0].suffix.lower())
             scenes += [Path(folder, scenes[0].stem + other) for other in others]
         opened = against_photos(data)
@@ -89,7 +89,7 @@ def compare(
             task = progress.add_task(f"Opening {escape(label)}", total=None)
             try:
                 if formats and path != scenes[0]:
-                    save(whole, path)
+                    save(source, path)
                 subject = opened(path)
                 progress.update(task, description=f"Measuring {escape(label)}", total=len(subject.truths))
                 measured = measured_by(subject, label=label, progress=partial(progress.advance, task))

@@ -74,10 +74,10 @@ def export(
     if page:
         second = [] if beside is None else [opened(beside, Wishes(), SceneDetails(), capture=True).for_page()]
         named = {name: link for name, _, link in (word.partition("=") for word in views)}
-        shown = before.for_page(out, lambda path, first: write_page(path, first, *second, views=named))
-        size, file = write_page(out, shown, *second, views=named), out if suffix else out / "scene.sundae"
+        first = before.for_page(out, lambda path, first: write_page(path, first, *second, views=named))
+        size, file = write_page(out, first, *second, views=named), out if suffix else out / "scene.sundae"
         print(f"{out}: {size:,} bytes; {'open it in a browser' if suffix else 'serve it'}")
-        costs = kind_of(scene) != "packed" or shown[1] is not before.scene
+        costs = kind_of(scene) != "packed" or first[1] is not before.scene
     elif lod:
         from sundae_ns.plugin.distill import levels_of  # imports nerfstudio, which takes seconds
 

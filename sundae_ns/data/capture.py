@@ -170,9 +170,9 @@ def check_first_image(path: Path, meta: Mapping[str, Any], factor: int) -> None:
 def beside(path: Path) -> str:
     """A remark on a file of another case, suffix or Unicode form than a missing one: `` (there is x.PNG)``; or ""."""
     wanted = [unicodedata.normalize("NFC", name).lower() for name in (path.stem, path.name)]
-    names = [one.name for one in entries(path.parent) if unicodedata.normalize("NFC", one.stem).lower() in wanted]
-    found = "" if path.name in names or not names else names[0]
-    return found and f" (there is {found if found.isascii() else ascii(found)})"
+    names = [entry.name for entry in entries(path.parent) if unicodedata.normalize("NFC", entry.stem).lower() in wanted]
+    other = "" if path.name in names or not names else names[0]
+    return other and f" (there is {other if other.isascii() else ascii(other)})"
 
 
 def entries(folder: Path) -> list[Path]:

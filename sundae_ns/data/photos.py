@@ -101,8 +101,8 @@ def left_out(folder: Path) -> str | None:
 
 def masks_beside(folder: Path) -> Path | None:
     """The first folder of masks in a folder of photos; None without one."""
-    found = (Path(parent, name) for parent, names, _ in os.walk(folder) for name in sorted(names))
-    return next((path for path in found if path.name.lower() in _MASKS), None)
+    paths = (Path(parent, name) for parent, names, _ in os.walk(folder) for name in sorted(names))
+    return next((path for path in paths if path.name.lower() in _MASKS), None)
 
 
 def upright(photo: Photo) -> tuple[Image.Image, Image.Exif]:
@@ -142,7 +142,7 @@ def photo_of(path: Path) -> Photo:
             kind, alpha, exif = str(image.format), image.has_transparency_data, image.getexif()
             orientation, lens, srgb = orientation_in(image), _lens(exif), images.is_srgb(image)
             told = f"{image.info.get('xmp')} {lens}".upper()
-            kind_of_model(next((one for one in ("EQUIRECTANGULAR", "CYLINDRICAL") if one in told), "OPENCV"), str(path))
+            kind_of_model(next((key for key in ("EQUIRECTANGULAR", "CYLINDRICAL") if key in told), "OPENCV"), str(path))
     if kind not in (*_COPIED, *_CONVERTED):
         raise DataError(f"{path} is a {kind} file by its contents; save it as JPEG or PNG, or remove it")
     check_shape(path, size)

@@ -146,8 +146,8 @@ def _find_features(work: Path, images: Path, names: Sequence[str], advance: Adva
         have = {image.name for image in database.read_all_images() if database.exists_keypoints(image.image_id)}
     missing = [name for name in names if name not in have]
     advance(len(names) - len(missing))
-    for part in _blocks(missing, 2 * threads(), advance):
-        module.extract_features(path, images, part, module.CameraMode.PER_FOLDER, reader, extraction)
+    for block in _blocks(missing, 2 * threads(), advance):
+        module.extract_features(path, images, block, module.CameraMode.PER_FOLDER, reader, extraction)
     with module.Database.open(path) as database:
         if database.num_keypoints() == 0:
             raise DataError("the photos show nothing that can be found again; add sharp ones of a scene with texture")
@@ -198,8 +198,8 @@ def _match(work: Path, pairs: Sequence[tuple[str, str]], advance: Advance) -> No
     module = pycolmap()
     options, listed = module.FeatureMatchingOptions(), module.ImportedPairingOptions()
     options.num_threads, listed.match_list_path = threads(), work / "pairs.txt"
-    for part in _blocks(pairs, _PAIRS_AT_ONCE * threads(), advance):
-        listed.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in part), encoding="utf-8", newline="\n")
+    for block in _blocks(pairs, _PAIRS_AT_ONCE * threads(), advance):
+        listed.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in block), encoding="utf-8", newline="\n")
         module.match_image_pairs(work / "database.db", options, listed)
 
 

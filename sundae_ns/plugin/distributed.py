@@ -86,7 +86,7 @@ class ShardedSource(GaussianSource):
     """The shard of this rank. A render, of a training step only, is collective."""
 
     def __init__(self, gaussians: Gaussians) -> None:
-        super().__init__(gaussians, whole=False)
+        super().__init__(gaussians, replayable=False)
         self.sizes: list[int] = []  # Gaussians of each rank
         self._rows = torch.empty(0)  # Rows of the shard in the order in which they were sent [S]
         self._sent: list[int] = []  # Number of rows sent to each rank in the last step; the sum is S

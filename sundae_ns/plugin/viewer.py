@@ -125,12 +125,12 @@ class ViewerControls(torch.nn.Module):
             gaussians, mask = preview.gaussians, preview.decision.mask
             if crop is not None:
                 gaussians, mask = gaussians.rows(crop[mask]), mask & crop
-            return Visible(GaussianSource(gaussians, whole=False), mask, compensate=False) if mask.any() else None
+            return Visible(GaussianSource(gaussians, replayable=False), mask, compensate=False) if mask.any() else None
         if in_viewer():
             compensate = self.compensate.value
         if crop is None:
             return Visible(source, None, compensate)
-        rows = GaussianSource(source.gaussians.rows(crop), whole=False)
+        rows = GaussianSource(source.gaussians.rows(crop), replayable=False)
         return Visible(rows, crop, compensate) if crop.any() else None
 
     def preview(self) -> Pruned | None:

@@ -41,7 +41,7 @@ class GsplatBackend:
             colors = torch.cat([colors, splats.depths[..., None]], dim=2)
         # Each pass overwrites absgrad with that of its own channels, so absgrad allows one pass only.
         passes = [colors] if inputs.absgrad else colors.split(_CHANNELS_PER_PASS, dim=2)
-        images, alphas = zip(*(self._blend(splats, part, lists, inputs.absgrad) for part in passes))
+        images, alphas = zip(*(self._blend(splats, channels, lists, inputs.absgrad) for channels in passes))
         return images[0] if len(images) == 1 else torch.cat(images, dim=-1), alphas[0], splats
 
     def _lists(self, splats: Splats, width: int, height: int) -> GsplatLists:

@@ -182,11 +182,11 @@ def _blend_tile(
     pixels = torch.stack([steps.repeat(BIN) + left, steps.repeat_interleave(BIN) + top])  # [2, P]
     blended: Any = 0
     through = torch.ones_like(pixels[:1])
-    for part in ids.split(_SEGMENT):
+    for chunk in ids.split(_SEGMENT):
         if (through <= MIN_TRANSMITTANCE).all():
             break
-        segment = partial(_blend_segment, part, absolute)
-        arguments = (pixels, through, *(value[part] for value in values))
+        segment = partial(_blend_segment, chunk, absolute)
+        arguments = (pixels, through, *(value[chunk] for value in values))
         # Evaluate the pixels again in the backward pass, because all alphas of an image may exceed the memory.
         if torch.is_grad_enabled():
             added, through = checkpoint(segment, *arguments, use_reentrant=False, preserve_rng_state=False)

@@ -43,7 +43,7 @@ class ShownView:
     index: int  # In the order of the capture, from 0
     name: str  # Of the photo's file
     size: tuple[int, int]  # Width and height of the measured truth, pixels
-    shown: tuple[int, int]  # Width and height of the images here
+    shown_size: tuple[int, int]  # Width and height of the images here
     full: ViewQuality
     base: ViewQuality | None  # Without the head; None if there is no head
     truth: str

@@ -95,9 +95,9 @@ def late_outputs(
         return feature_colors(image, *principal_components(gaussians[FEATURES]), alpha)
 
     def response_image() -> Tensor:
-        if (shown := values()) is None:
+        if (responses := values()) is None:
             return torch.zeros_like(alpha)
-        return splat(drawn, camera, (shown if mask is None else shown[mask])[:, None], settings).colors
+        return splat(drawn, camera, (responses if mask is None else responses[mask])[:, None], settings).colors
 
     outputs = {**images, "depth": depth, "features": features, "response": response_image}
     return LazyOutputs({name: outputs[name] for name in OUTPUTS})

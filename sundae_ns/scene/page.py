@@ -73,13 +73,13 @@ def packed_of(scene: Scene, config: PackConfig | None = None) -> bytes:
     return pack_bytes(*fit_scene(contents_of(scene), config))[0]
 
 
-def write_page(path: Path, *shown: Shown, views: Mapping[str, View] | None = None) -> int:
+def write_page(path: Path, *scenes: Shown, views: Mapping[str, View] | None = None) -> int:
     """Write the page of one or two scenes as one file, or without a suffix as a folder; returns the bytes."""
-    names = [] if path.suffix else [f"scene{i or ''}.sundae" for i in range(len(shown))]
-    content = page_of(*shown, views=views, files=names).encode(errors="backslashreplace")
+    names = [] if path.suffix else [f"scene{i or ''}.sundae" for i in range(len(scenes))]
+    content = page_of(*scenes, views=views, files=names).encode(errors="backslashreplace")
     # The first is put in place last: without its scene a page shows an error.
     files = {path if path.suffix else path / "index.html": content}
-    files |= {path / name: packed for name, (*_, packed) in zip(names, shown)}
+    files |= {path / name: packed for name, (*_, packed) in zip(names, scenes)}
     write_files(files)
     return sum(map(len, files.values()))
 
@@ -95,17 +95,17 @@ def opened_page(page: Path) -> Iterator[Path]:
         yield packed
 
 
-def page_of(*shown: Shown, views: Mapping[str, View] | None = None, files: Sequence[str] = ()) -> str:
+def page_of(*scenes: Shown, views: Mapping[str, View] | None = None, files: Sequence[str] = ()) -> str:
     """The HTML of a page that contains its scenes, or that reads them from files beside it; see :func:`page`."""
-    if not 1 <= len(shown) <= 2:
-        raise ConfigError(f"a page of {len(shown)} scenes was asked for; give one or two")
-    links = json.dumps([(name, link_of(view, shown[0][1], name)) for name, view in (views or {}).items()])
+    if not 1 <= len(scenes) <= 2:
+        raise ConfigError(f"a page of {len(scenes)} scenes was asked for; give one or two")
+    links = json.dumps([(name, link_of(view, scenes[0][1], name)) for name, view in (views or {}).items()])
     places = [
         f'<script type="application/octet-stream" class="scene" data-name="{html.escape(name)}"'
         f' data-source="{file}">{"" if file else base64.b64encode(packed).decode()}</script>'
-        for (name, _, packed), file in zip(shown, files or [""] * len(shown), strict=True)
+        for (name, _, packed), file in zip(scenes, files or [""] * len(scenes), strict=True)
     ]
-    values = {"TITLE": html.escape(" | ".join(name for name, *_ in shown)), "POSTER": _poster(shown[0][1])}
+    values = {"TITLE": html.escape(" | ".join(name for name, *_ in scenes)), "POSTER": _poster(scenes[0][1])}
     values |= {"VIEWS": links.replace("<", "\\u003c"), "SCENES": "\n".join(places)}
     template = resources.files("sundae_ns.scene").joinpath("page.html").read_text(encoding="utf-8")
     # In one pass: a title may contain the name of another value.
@@ -120,8 +120,8 @@ def link_of(view: View, scene: Scene, name: str) -> str:
         return f"#camera={','.join(f'{value:.7g}' for value in (*view.center.tolist(), *ahead))},1"
     stops = max(len(scene.cameras), 1)
     link = f"#camera={view + 1}" if isinstance(view, int) else f"#{view.rpartition('#')[2]}"
-    *place, stop = link.removeprefix("#camera=").split(",")
-    if not (link.startswith("#camera=") and len(place) in (0, 6) and stop.isdecimal() and 0 < int(stop) <= stops):
+    *numbers, stop = link.removeprefix("#camera=").split(",")
+    if not (link.startswith("#camera=") and len(numbers) in (0, 6) and stop.isdecimal() and 0 < int(stop) <= stops):
         raise ConfigError(f"view {name!r} is {view!r}; give a camera, an index below {stops}, or a link of the page")
     return link
 

@@ -63,11 +63,11 @@ def colors_from(params: Mapping[str, Tensor], gaussians: Gaussians, center: Tens
 
 
 class GaussianSource:
-    """The Gaussians of one process; not ``whole``: a share, new tensors each time, whose frames are not recorded."""
+    """The Gaussians of one process. Those that are not ``replayable``, a share, are new tensors each time."""
 
-    def __init__(self, gaussians: Gaussians, *, whole: bool = True) -> None:
+    def __init__(self, gaussians: Gaussians, *, replayable: bool = True) -> None:
         self.gaussians = gaussians
-        self.replayable = whole
+        self.replayable = replayable
 
     @property
     def total(self) -> int:

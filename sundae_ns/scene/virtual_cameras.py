@@ -95,10 +95,10 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
             near, ahead = eyes.repeat(MOVED, 1), targets.repeat(MOVED, 1)
             moved = near + STEP / 3**0.5 * near.norm(dim=1, keepdim=True) * normal(len(near), 3)
             turns = torch.rand(len(near), 1, generator=generator) < 0.5  # the others look at the same Gaussian
-            moved, ahead, found = best_of(moved, torch.where(turns, random_targets(len(near)), ahead))
-            better = found < coarseness
+            moved, ahead, moved_coarseness = best_of(moved, torch.where(turns, random_targets(len(near)), ahead))
+            better = moved_coarseness < coarseness
             eyes, targets = torch.where(better[:, None], moved, eyes), torch.where(better[:, None], ahead, targets)
-            coarseness = torch.where(better, found, coarseness)
+            coarseness = torch.where(better, moved_coarseness, coarseness)
         return eyes, targets
 
     eyes, targets = climb(n - n // 2, 0.0)

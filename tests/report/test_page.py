@@ -154,7 +154,7 @@ def test_images_of_a_view_have_one_size_and_small_ones_lose_nothing(measured, si
     run, (photo, rendering, bare) = measured(), images(0, *size)
     given = layers(photo, rendering, bare, head=head)
     view = shown_view(3, "a.png", *given, run.full.views[0], run.base.views[0] if head else None)
-    assert (view.index, view.name, view.size, view.shown) == (3, "a.png", size[::-1], expected)
+    assert (view.index, view.name, view.size, view.shown_size) == (3, "a.png", size[::-1], expected)
     assert list(view.images) == ["rendering", *(["head off"] if head else []), "error map"]
     given = {"photo": photo, "rendering": rendering, "head off": bare}
     for name, address in {"photo": view.truth, **view.images}.items():

@@ -189,7 +189,7 @@ def test_nothing_is_recorded_on_a_cpu_or_in_training(model, view, monkeypatch):
         assert frames._recordable(source, settings)
         assert not frames._recordable(empty, settings)
         assert not frames._recordable(source, replace(settings, training=True))
-        assert not frames._recordable(GaussianSource(source.gaussians, whole=False), settings)
+        assert not frames._recordable(GaussianSource(source.gaussians, replayable=False), settings)
     assert not frames._recordable(source, settings)  # with gradients
 
 

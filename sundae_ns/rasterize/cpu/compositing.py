@@ -249,13 +249,13 @@ def _blend_backward(begin: int, end: int, lists: Any, blended: Any, gradients: A
                         slope_y = fma(dx, row[XY], dy * (number(2) * row[HALF_YY]))
                         absolute_x = absolute_x + absolute(grad_exponent * slope_x)
                         absolute_y = absolute_y + absolute(grad_exponent * slope_y)
-            part = entry * parts.shape[1]
+            offset = entry * parts.shape[1]
             if needs_colors:
                 for c in range(0, padded, _GROUP):
-                    _sum_channels(weights, grads, spans[entry, 0], spans[entry, 1], c, parts, part + c)
+                    _sum_channels(weights, grads, spans[entry, 0], spans[entry, 1], c, parts, offset + c)
             if needs_geometry:
-                store_sums(parts, part + padded, m, mx, my, mxx)
-                store_sums(parts, part + padded + 4, mxy, myy, absolute_x, absolute_y)
+                store_sums(parts, offset + padded, m, mx, my, mxx)
+                store_sums(parts, offset + padded + 4, mxy, myy, absolute_x, absolute_y)
 
 
 @inlined
@@ -270,7 +270,7 @@ def _product(grads: Any, at: int, row: Any, channels: int) -> Any:
 
 
 @inlined
-def _sum_channels(weights: Any, grads: Any, first: int, beyond: int, channel: int, parts: Any, part: int) -> None:
+def _sum_channels(weights: Any, grads: Any, first: int, beyond: int, channel: int, parts: Any, offset: int) -> None:
     """Write the sums, over the touched pixels of a tile, of weights times the gradients of four channels."""
     a = b = c = d = zeros(weights)
     for step in range(first, beyond):
@@ -278,7 +278,7 @@ def _sum_channels(weights: Any, grads: Any, first: int, beyond: int, channel: in
         at = (step * grads.shape[1] + channel) * WIDTH
         a, b = fma(weight, load(grads, at), a), fma(weight, load(grads, at + WIDTH), b)
         c, d = fma(weight, load(grads, at + 2 * WIDTH), c), fma(weight, load(grads, at + 3 * WIDTH), d)
-    store_sums(parts, part, a, b, c, d)
+    store_sums(parts, offset, a, b, c, d)
 
 
 @compiled

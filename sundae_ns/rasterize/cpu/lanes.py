@@ -37,8 +37,8 @@ class Lanes(types.Type):
 @register_model(Lanes)
 class _Model(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Lanes) -> None:
-        one = ir.IntType(1) if kind.number == types.boolean else manager.lookup(kind.number).get_value_type()
-        super().__init__(manager, kind, ir.VectorType(one, kind.width))
+        element = ir.IntType(1) if kind.number == types.boolean else manager.lookup(kind.number).get_value_type()
+        super().__init__(manager, kind, ir.VectorType(element, kind.width))
 
 
 MASK = Lanes(types.boolean)
@@ -94,9 +94,9 @@ def _operator(function: Callable[..., Any], write: Callable[..., Any], result: L
         return call if isinstance(a, Lanes) or isinstance(b, Lanes) else None
 
 
-def _by_kind(whole: str, real: str, *sign: str) -> Callable[..., Any]:
+def _by_kind(integer: str, real: str, *sign: str) -> Callable[..., Any]:
     """Code generator of an instruction for whole numbers or for floats; of a comparison by its sign."""
-    return lambda builder, a, b: getattr(builder, whole if a.type.element == _WORD else real)(*sign, a, b)
+    return lambda builder, a, b: getattr(builder, integer if a.type.element == _WORD else real)(*sign, a, b)
 
 
 _compared = partial(_by_kind, "icmp_signed", "fcmp_ordered")
