@@ -21,7 +21,7 @@ from sundae_ns.scene.render import pass_inputs
 from sundae_ns.scene.scene import Scene
 
 FOV = 40.0
-VIEWS = {"cpu": 128, "cuda": 256}  # default number of cameras by the device
+VIEWS = {"cpu": 128, "cuda": 256}  # largest default number of cameras, by the device
 SIDE = 512  # default width and height of their images, pixels
 T = TypeVar("T")
 
@@ -50,7 +50,7 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
 
     Args:
         scene: its finite Gaussians count.
-        n: number of cameras; by default 128 for a scene on a CPU and 256 for one on a GPU.
+        n: number of cameras; by default one for 32 Gaussians, at least 32, at most 128 on a CPU and 256 on a GPU.
         seed: of the random draws, which are the same on every device up to rounding.
         size: width and height of the images, pixels; by default 512, or ``16 sqrt(N)`` for fewer Gaussians.
 
@@ -62,7 +62,8 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
     >>> len(sn.virtual_cameras(scene, 8))
     8
     """
-    n = whole(by_device(VIEWS, scene.device) if n is None else n, "n", most=10_000)
+    usual = min(by_device(VIEWS, scene.device), max(scene.num_gaussians // 32, 32))
+    n = whole(usual if n is None else n, "n", most=10_000)
     size = min(SIDE, max(64, 16 * math.isqrt(scene.num_gaussians))) if size is None else size
     gaussians = usable(scene)
     middle, reach = middle_and_reach(gaussians)
@@ -169,9 +170,8 @@ def split(cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:
 
 def resized(gaussians: Gaussians, factor: float) -> Gaussians:
     """The Gaussians, ``factor`` times as large."""
-    if factor == 1:
-        return gaussians
-    return gaussians.replaced({"means": gaussians["means"] * factor, "scales": gaussians["scales"] + math.log(factor)})
+    scaled = {"means": gaussians["means"] * factor, "scales": gaussians["scales"] + math.log(factor)}
+    return gaussians if factor == 1 else gaussians.replaced(scaled)
 
 
 def usable(scene: Scene) -> Gaussians:
