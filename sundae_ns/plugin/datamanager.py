@@ -73,7 +73,7 @@ class CheckedDataset(InputDataset):
                 self.turned[index], full = orientation, full[::-1]
             if mask is not None and check_image(mask, mask=True) != full:
                 raise DataError(f"{mask} differs in size from its image {path.name}; make it {full[0]} x {full[1]} px")
-            if mask is not None and exif_orientation(mask) not in (1, exif_orientation(path)):
+            if mask is not None and (turn := exif_orientation(mask)) != 1 and turn != exif_orientation(path):
                 raise DataError(f"{mask} is turned by its EXIF entry, and its image is not; save both upright")
         self._checked = True
 

@@ -40,8 +40,7 @@ def scene_of(packed: PackedScene) -> Scene:
         meta.pop("frame", None)
     up, start = start_of(packed.meta)
     cameras: tuple[Camera, ...] = ()
-    arrays = packed.cameras
-    if arrays is not None:
+    if (arrays := packed.cameras) is not None:
         rows = zip(arrays["poses"], arrays["intrinsics"].tolist(), arrays["sizes"].tolist(), strict=True)
         cameras = tuple(Camera.from_pose(pose, intrinsics, *size) for pose, intrinsics, size in rows)
     return Scene(

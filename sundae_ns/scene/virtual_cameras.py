@@ -170,8 +170,9 @@ def split(cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:
 
 def resized(gaussians: Gaussians, factor: float) -> Gaussians:
     """The Gaussians, ``factor`` times as large."""
-    scaled = {"means": gaussians["means"] * factor, "scales": gaussians["scales"] + math.log(factor)}
-    return gaussians if factor == 1 else gaussians.replaced(scaled)
+    if factor == 1:
+        return gaussians
+    return gaussians.replaced({"means": gaussians["means"] * factor, "scales": gaussians["scales"] + math.log(factor)})
 
 
 def usable(scene: Scene) -> Gaussians:
