@@ -64,6 +64,8 @@ def rasterize_cameras(inputs: Inputs, viewmats: Tensor, Ks: Tensor, *, backend: 
 
 def each_view(function: Callable[[Any], T], views: Iterable[Any], *, two_at_once: bool) -> Iterator[T]:
     """Results of a function for each view; ``two_at_once`` on a CPU, where parts of a view take one core."""
+    # A forked process makes torch's own pool anew in the first call that needs it; two at once would fail.
+    torch.set_num_threads(torch.get_num_threads())
     with ThreadPoolExecutor(2) as pool:
         yield from (pool.map if two_at_once else map)(function, views)
 
@@ -122,12 +124,11 @@ def blending_weights(inputs: Inputs, pixels: Tensor | None = None, *, backend: B
 
 
 def _check(inputs: Inputs) -> None:
-    (viewmat, K, width, height, _), colors, n = inputs.camera, inputs.colors, len(inputs.means)
-    if width < 1 or height < 1:
-        raise DataError(f"an image of {width}x{height} pixels is empty; width and height must be at least 1")
+    camera, colors, n = inputs.camera, inputs.colors, len(inputs.means)
+    if min(size := (camera.width, camera.height)) < 1:
+        raise DataError(f"an image of {size[0]}x{size[1]} pixels is empty; width and height must be at least 1")
     shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "viewmat": (4, 4), "K": (3, 3)}
-    tensors = {**vars(inputs), "viewmat": viewmat, "K": K}
-    tensors = {name: tensors[name] for name in shapes}
+    tensors = {name: getattr(inputs if hasattr(inputs, name) else camera, name) for name in shapes}
     _check_shapes(*((value, name, shapes[name]) for name, value in tensors.items()))
     if colors.dim() != 2 or colors.shape[0] != n or colors.shape[1] < 1:
         raise DataError(f"colors has shape {list(colors.shape)}; pass [{n}, C] with at least one channel")
@@ -161,8 +162,7 @@ def select_backend(name: BackendName, device: torch.device | str) -> Backend:
         raise ConfigError(f"unknown rasterizer {name!r}; use auto, gsplat, cpu or reference")
     for backend, make, problem_on in (("gsplat", GsplatBackend, _gsplat_problem), ("cpu", _cpu_backend, _cpu_problem)):
         if name in ("auto", backend):
-            problem = problem_on(device)
-            if problem is None:
+            if (problem := problem_on(device)) is None:
                 return make()
             if name == backend:
                 raise BackendError(f"{backend} cannot rasterize: {problem}; or use the backend 'reference'")
