@@ -16,7 +16,6 @@ from sundae_ns.core.gaussians import sh_degree
 from sundae_ns.io.formats import FORMATS, kind_of, write_for_viewers, write_levels
 from sundae_ns.io.run_folder import files_of
 from sundae_ns.io.sog import STREAMED
-from sundae_ns.io.spz import clamped
 from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.scene.load_save import marks_of
 from sundae_ns.scene.page import write_page
@@ -98,8 +97,6 @@ def export(
             written = write_for_viewers(out, left.stated.gaussians, marks_of(left.stated), upright=upright)
         mode, degree = ", antialiased" if left.scene.antialiased else "", sh_degree(written["features_rest"])
         print(f"{out}: {len(written['means']):,} Gaussians, degree {degree}{mode}, {out.stat().st_size:,} bytes")
-        if suffix == ".spz" and (beyond := clamped(written)):
-            print(f"clamped scales or colours of {beyond:,} Gaussians to the range of a .spz; a .sog has none")
         if degree < left.stated.gaussians.sh_degree:
             print(f"left out harmonics above SH degree {degree}, which {suffix} cannot store; .ply can")
         exact = suffix in (".ply", ".glb") and degree == before.scene.gaussians.sh_degree

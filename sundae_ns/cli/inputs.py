@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
@@ -136,13 +136,15 @@ class Edit(NamedTuple):
             forms = Form.choices(scene, out.suffix.lower())[: None if rounds else 1]
 
             def file_of(pruned: PrunedScene, form: Form) -> bytes:
-                (write or Edit.write)(after(pruned, form), Path(folder, out.name))
+                with redirect_stderr(StringIO()):  # warnings of each try
+                    (write or Edit.write)(after(pruned, form), Path(folder, out.name))
                 return b"".join(path.read_bytes() for path in Path(folder).rglob("*") if path.is_file())
 
             most = int(wishes.max_mb * MEGABYTE)
             with TemporaryDirectory() as folder:
                 pruned, form, file = prune_to_bytes(scene, most, file_of, forms, cameras, rule)
-            return after(pruned, form)._replace(file=file)
+            # A .spz is written again, which warns of what it clamps.
+            return after(pruned, form)._replace(file=None if out.suffix.lower() == ".spz" else file)
 
     def for_page(self, out: Path = Path("page.html"), write: Callable[[Path, Shown], object] = write_page) -> Shown:
         """Name, scene and packed file of what a page shows, which ``write`` makes; a packed scene stays as it is."""

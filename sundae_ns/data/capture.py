@@ -17,7 +17,7 @@ import numpy as np
 from sundae_ns.core.errors import DataError, reading, regular
 from sundae_ns.data.lenses import DISTORTION, FISHEYE624, INTRINSICS, REMEDY, kind_of_model, lens_of, with_focal_lengths
 
-_MAX_SIDE = 65535  # pixels: JPEG's limit
+_MAX_SIDE, _MOST_BYTES = 65535, 32_000_000  # pixels: JPEG's limit; of a file, as 30,000 images have
 _LARGEST = 1e12  # its square must stay in the range of float32
 
 
@@ -46,8 +46,7 @@ def matrix(value: Any, rows: Sequence[int], name: str, where: str) -> np.ndarray
         raise DataError(f"{where}: {name} must have {' or '.join(map(str, rows))} rows of 4 numbers; correct the file")
     for entry in chain(*value):
         finite(entry, name, where)
-    array = np.array(value, dtype=np.float64)
-    if abs(np.linalg.det(array[:3, :3])) < 1e-9:
+    if abs(np.linalg.det((array := np.array(value, np.float64))[:3, :3])) < 1e-9:
         raise DataError(f"{where}: {name} is singular, so it is not a camera pose; remove this view")
     return array
 
@@ -65,9 +64,11 @@ def rigid(pose: np.ndarray, where: str) -> np.ndarray:
 def read_json(path: Path) -> dict[str, Any]:
     """The JSON object of a file; ``DataError`` if it cannot be read or holds none."""
     with reading(path, "JSON", remedy="write it again"):
-        if regular(path).stat().st_size > 32_000_000:  # that of 30,000 images
-            raise DataError(f"{path} has more than 32 MB; split it")
-        content = json.loads(path.read_bytes().replace(rb"\\", b"/"))  # paths of Windows
+        with regular(path).open("rb") as file:
+            text = file.read(_MOST_BYTES + 1)
+        if len(text) > _MOST_BYTES or sum(map(text.count, b"[{:")) > 2_000_000:
+            raise DataError(f"{path} has more than 32 MB, or two million lists and entries; split it")
+        content = json.loads(text.replace(rb"\\", b"/"))  # paths of Windows
     if not isinstance(content, dict):
         raise DataError(f"{path} does not hold a JSON object; give the transforms.json of a capture")
     return content
@@ -155,8 +156,7 @@ _CHECKS: dict[str, Callable[[Any, str, str], Any]] = {
 def check_first_image(path: Path, meta: Mapping[str, Any], factor: int) -> None:
     """Raise ``DataError`` unless the first image of a ``transforms.json`` is there at 1/factor of its size."""
     stated = {**meta, **meta["frames"][0]}
-    image = path.parent / stated["file_path"]
-    small = path.parent / f"images_{factor}"
+    image, small = path.parent / stated["file_path"], path.parent / f"images_{factor}"
     if factor == 1 or small.exists():
         if not (image := image if factor == 1 else small / image.name).exists():
             raise DataError(f"{image} does not exist{beside(image)}; correct file_path in {path.name}")

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import gzip
 import io
+import logging
 import struct
 from collections.abc import Mapping
 from pathlib import Path
@@ -44,7 +45,9 @@ _OPPOSITE = dict(zip("LRDUBF", "RLUDFB", strict=True))
 _COORDINATE_SYSTEM = 0xADBE0003
 _COMMENTED = b"\x1f\x8b\x08\x10"  # the begin of a gzip stream with a comment
 _HARMONICS_STEP = 1 / 64  # costs 0.03 dB; twice this step costs 0.12 dB (docs/formats.md)
+_RANGES = {"scales": (-10, 5.9375), "features_dc": (-0.5 / 0.15, 0.5 / 0.15), "features_rest": (-1, 1)}  # stored values
 _HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, reserved
+_log = logging.getLogger(__name__)
 
 
 def fractional_bits(means: Tensor) -> int:
@@ -66,14 +69,17 @@ def write_spz(path: Path, params: Mapping[str, Tensor], marks: Marks = UNMARKED)
 
     gaussians = checked(path, params)
     bits = fractional_bits(gaussians["means"])
+    over = {name: (gaussians[name] - gaussians[name].clamp(*ends)).flatten(1).abs() for name, ends in _RANGES.items()}
+    if beyond := int(torch.cat([*over.values()], dim=1).any(dim=1).sum()):
+        most = ", ".join(f"{name} by up to {value.max():.3g}" for name, value in over.items() if value.any())
+        _log.warning("%s clamps %s Gaussians to what a .spz stores: %s; a .sog has no such limits", path, beyond, most)
     gaussians["features_rest"] = (gaussians["features_rest"] / _HARMONICS_STEP).round() * _HARMONICS_STEP
     means, scales, quats, colors, rest, opacities = (gaussians[name].numpy() for name in SPLAT_NAMES)
     data = GSData.from_arrays(means, scales, quats, opacities[:, 0], colors, rest if rest.size else None, format="ply")
     with replacing(path) as partial:
         write(partial, data, version=3, fractional_bits=bits)  # more programs read version 3 than 4
-        # gsply 0.4 has no option for the flag of antialiasing, in byte 14.
         raw = bytearray(gzip.decompress(partial.read_bytes()))
-        raw[14] |= marks.antialiased
+        raw[14] |= marks.antialiased  # flags, for which gsply 0.4 has no option
         packed, stated = gzip.compress(bytes(raw), mtime=0), "\n".join(comments_of(marks)).encode()
         partial.write_bytes(_COMMENTED + packed[4:10] + stated + b"\0" + packed[10:])
 
@@ -157,14 +163,8 @@ def _stated_axes(extensions: memoryview) -> str | None:
     while len(extensions) >= 12:
         kind, size, system = struct.unpack_from("<III", extensions)
         if kind == _COORDINATE_SYSTEM and system > 0:
+            if system > len(_AXES):
+                raise ValueError(f"it states axes number {system}, and known are 1 to {len(_AXES)}")
             return _AXES[system - 1]
         extensions = extensions[8 + size :]
     return None
-
-
-def clamped(gaussians: Mapping[str, Tensor]) -> int:
-    """Number of Gaussians with a scale or an SH coefficient beyond what a .spz stores; it stores the nearest value."""
-    beyond = ((gaussians["scales"] < -10) | (gaussians["scales"] > 5.9375)).any(dim=1)
-    beyond |= (gaussians["features_dc"].abs() > 0.5 / 0.15).any(dim=1)
-    beyond |= (gaussians["features_rest"].flatten(1).abs() > 1).any(dim=1)
-    return int(beyond.sum())

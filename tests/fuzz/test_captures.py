@@ -246,6 +246,7 @@ def _written(text):
 TEXTS = ("", "[1, 2]", "[" * 200_000, '{"frames": ' + "9" * 5000 + "}", '{"frames": [', "\udcff")
 FOLDERS = {
     **{f"text {number}": (_written(text), "transforms.json") for number, text in enumerate(TEXTS)},
+    "lists of 30 MB": (_written('{"frames": [' + "[]," * 9_900_000 + "[]]}"), "has more than .* two million lists"),
     "no folder": (shutil.rmtree, "does not exist; give the folder of the capture"),
     "no transforms": (lambda data: (data / "transforms.json").unlink(), "has no transforms.json; it is in COLMAP"),
 }

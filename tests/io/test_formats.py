@@ -21,7 +21,7 @@ from sundae_ns.head.head import bytes_of_module
 from sundae_ns.io.formats import kind_of, read_gaussian_file, read_gaussians, refuse, write_for_viewers, write_levels
 from sundae_ns.io.pack.packed_scene import PackedScene, write_scene
 from sundae_ns.io.ply import Marks, keep_vertices, read_ply, read_point_cloud, write_ply
-from sundae_ns.io.spz import clamped, fractional_bits
+from sundae_ns.io.spz import fractional_bits
 
 PROGRAM = shutil.which("splat-transform")
 # Half a step of each format, plus rounding; codebooks by their worst case.
@@ -202,10 +202,12 @@ def test_positions_of_a_spz_get_as_many_bits_as_fit(tmp_path, farthest, bits):
     assert (means - gaussians["means"]).abs().max() <= 2.0 ** -(bits + 1) + 1e-7
 
 
-def test_values_beyond_the_range_of_a_spz_are_counted(tmp_path):
+def test_values_beyond_the_range_of_a_spz_are_named(tmp_path, caplog):
     gaussians = small_field()
     gaussians["scales"][0, 0], gaussians["features_dc"][1, 2], gaussians["features_rest"][2, 0, 0] = 7.0, 4.0, -1.5
-    assert clamped(write_for_viewers(tmp_path / "a.spz", gaussians)) == 3
+    write_for_viewers(tmp_path / "a.spz", gaussians)
+    stored = "what a .spz stores: scales by up to 1.06, features_dc by up to 0.667, features_rest by up to 0.5;"
+    assert f"a.spz clamps 3 Gaussians to {stored}" in caplog.text
 
 
 def test_kinds_follow_from_first_bytes(tmp_path):

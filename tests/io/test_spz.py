@@ -79,7 +79,7 @@ HOSTILE = {
     "version 4 in gzip": (lambda: gzip.compress(spz(FIELD, 4)), "version 1 to 4"),
     "another gzip file": (lambda: gzip.compress(b"ply" * 9), "version 1 to 4; gunzip other files"),
     "99 fractional bits": (lambda: spz(FIELD, 3, bits=99), "version 1 to 4"),
-    "unknown axes": (lambda: spz(FIELD, 4, axes=17), "out of range"),
+    "unknown axes": (lambda: spz(FIELD, 4, axes=17), "axes number 17, and known are 1 to 16"),
 }
 
 
