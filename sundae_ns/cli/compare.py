@@ -83,8 +83,8 @@ def compare(
             scenes += [Path(folder, scenes[0].stem + other) for other in others]
         opened = against_photos(data)
         if first is not None:
-            chosen = held_out_cameras(first, chosen_cameras(first, cameras, num_cameras), num_cameras)
-            opened = against_first(scenes[0], first, chosen)
+            chosen, _ = chosen_cameras(first, cameras, num_cameras)
+            opened = against_first(scenes[0], first, held_out_cameras(first, chosen, num_cameras))
         for path, label in zip(scenes, labels_of(scenes), strict=True):
             task = progress.add_task(f"Opening {escape(label)}", total=None)
             try:
@@ -117,6 +117,8 @@ def compare(
         files = {"json": json.dumps(rows, indent=1), "csv": csv_text(rows), "md": markdown(groups, notes), "html": page}
         write_files({out / f"report.{kind}": text.encode(errors="backslashreplace") for kind, text in files.items()})
         print(f"wrote {out / 'report.html'}, for a browser ({len(page) / 1e6:.1f} MB), report.md, .csv and .json")
-    if low := [run.label for run in runs if run.full.views and not (run.full.mean("psnr") or 0) >= (min_psnr or 0)]:
-        print(f"below {min_psnr or 0:g} dB: {', '.join(low)}", file=sys.stderr)
+    means = {run.label: run.full.mean("psnr") for run in runs if run.full.views}
+    low = [] if min_psnr is None else [label for label, psnr in means.items() if psnr is None or psnr < min_psnr]
+    if low:
+        print(f"below {min_psnr:g} dB: {', '.join(low)}", file=sys.stderr)
     return 1 if failures or low else 0

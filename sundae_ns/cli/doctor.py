@@ -91,11 +91,13 @@ def parts(compile_kernels: bool = False) -> list[Part]:
 def _checked(name: str, check: Callable[[], str | None], remedy: str, purpose: str) -> Part:
     """The part of a check, which returns nothing or raises an error if the part is missing."""
     try:
-        text = check()
-        works, text = bool(text), text or "not found"
-    except (metadata.PackageNotFoundError, SundaeError) as error:
-        works, text = False, str(error) if isinstance(error, SundaeError) else "not installed"
-    return Part(name, works, f"{text}, for {purpose}" if purpose else text, remedy)
+        found, problem = check(), "not found"
+    except metadata.PackageNotFoundError:
+        found, problem = None, "not installed"
+    except SundaeError as error:
+        found, problem = None, str(error)
+    text = found or problem
+    return Part(name, bool(found), f"{text}, for {purpose}" if purpose else text, remedy)
 
 
 def _cuda() -> str:

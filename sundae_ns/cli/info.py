@@ -23,7 +23,8 @@ def info(scene: Scene, cameras: File = None, json: Flag = False) -> int:
         json: print one JSON object.
     """
     opened = load(scene).to(fastest_device())
-    facts = describe(opened, scene, chosen_cameras(opened, cameras, None), console=Console(stderr=True))
+    chosen, _ = chosen_cameras(opened, cameras, None)
+    facts = describe(opened, scene, chosen, console=Console(stderr=True))
     if json:
         print(dumps(without_nan(facts)))
         return 0

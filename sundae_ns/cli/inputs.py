@@ -29,7 +29,7 @@ from sundae_ns.io.pack import container
 from sundae_ns.io.ply import has_own_columns, keep_vertices
 from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.rasterize.interface import fastest_device
-from sundae_ns.scene.cameras import cameras_of, opening, spread, with_start
+from sundae_ns.scene.cameras import opening, read_cameras, spread, with_start
 from sundae_ns.scene.compose import crop_mask, floater_mask, transform
 from sundae_ns.scene.describe import write_preview
 from sundae_ns.scene.load_save import load, load_with_mask, save
@@ -48,6 +48,7 @@ class Edit(NamedTuple):
     scene: Scene
     rows: Tensor  # True for the Gaussians of the file that are left, bool [N]
     cameras: Sequence[Camera]  # those given or stored; of a pruned scene, those that decided
+    speed: float | None = None  # of a camera path, frames per second
     form: Form = Form()  # of a file of a given size
     pruned: PrunedScene | None = None
     file: bytes | None = None  # what a search for a size has written
@@ -153,13 +154,8 @@ class Edit(NamedTuple):
         if is_run(self.source):  # its file is CAPTURE/METHOD/TIME/config.yml
             name = config_of(self.source).resolve().parents[2].name
         left = self.reduced(out, write=lambda edit, path: write(path, shown_as(name, edit.stated, edit.form.precision)))
-        if (
-            kind_of(self.source) != "packed"
-            or self.wishes.cleans
-            or self.wishes.reduces
-            or details.no_head
-            or details.cameras
-        ):
+        same = kind_of(self.source) == "packed" and not (self.wishes.cleans or self.wishes.reduces)
+        if not same or details.no_head or details.cameras is not None:
             return shown_as(name, left.stated, left.form.precision)
         packed = self.source.read_bytes()
         if details.start_view is not None or details.up is not None:
@@ -198,13 +194,13 @@ def opened(source: Path, wishes: Wishes, details: SceneDetails, *, capture: bool
         scene, rows = open_run(source, max_cameras=most, data=details.data), None
     else:
         scene, rows = load_with_mask(source)
-    cameras = chosen_cameras(scene, details.cameras, None)
+    cameras, speed = chosen_cameras(scene, details.cameras, None)
     scene = replace(scene, cameras=tuple(cameras[i] for i in spread(len(cameras), most)))
     scene = with_start(scene, details.start_view, details.up)
     rows = torch.ones(len(scene), dtype=torch.bool) if rows is None else rows
     if wishes.count is not None and wishes.count > len(scene):
         print(f"warning: {source} has {len(scene):,} Gaussians, not {wishes.count:,}; all are kept", file=sys.stderr)
-    return Edit(source, wishes, details, scene, rows, cameras)
+    return Edit(source, wishes, details, scene, rows, cameras, speed)
 
 
 def open_run(run: Path, **options: Any) -> Scene:
@@ -222,12 +218,12 @@ def is_run(path: Path) -> bool:
     return (path.is_dir() or path.name == "config.yml") and find_config(path) is not None
 
 
-def chosen_cameras(scene: Scene, cameras: Path | None, most: int | None) -> Sequence[Camera]:
-    """Cameras of a file, or at most ``most`` of a run; by default those stored with the scene, which may be none."""
-    if cameras is None:
-        return scene.cameras
-    if kind_of(cameras) == "packed":
-        return load(cameras).cameras
-    if is_run(cameras):
-        return open_run(cameras, max_cameras=most or VIEWS["cpu"]).cameras
-    return cameras_of(cameras, scene)
+def chosen_cameras(scene: Scene, path: Path | None, most: int | None) -> tuple[Sequence[Camera], float | None]:
+    """Cameras as :func:`.read_cameras`, or at most ``most`` of a run; without a path the stored ones, if any."""
+    if path is None:
+        return scene.cameras, None
+    if kind_of(path) == "packed":
+        return load(path).cameras, None
+    if is_run(path):
+        return open_run(path, max_cameras=most or VIEWS["cpu"]).cameras, None
+    return read_cameras(path, scene)

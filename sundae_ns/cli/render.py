@@ -12,7 +12,7 @@ from sundae_ns.cli.refusals import check_file, check_least, check_suffix
 from sundae_ns.core.errors import ConfigError
 from sundae_ns.core.files import replacing, write_image, write_video
 from sundae_ns.rasterize.interface import fastest_device
-from sundae_ns.scene.cameras import MOST_CAMERAS, film_views, opening, read_cameras
+from sundae_ns.scene.cameras import MOST_CAMERAS, film_views, opening
 from sundae_ns.scene.scene import image_of
 from sundae_ns.scene.scene import render as render_view
 
@@ -45,17 +45,16 @@ def render(
     if fps is not None and not (video and 0 < fps <= 240):
         raise ConfigError("--fps is of a video, from above 0 to 240; leave it out, or name a video .mp4")
     wishes.check_wishes()
-    check_file(out, reads=[scene, path := advanced.cameras], overwrite=advanced.overwrite)
-    left = opened(scene, wishes, advanced, most=MOST_CAMERAS).reduced(Path("scene.sundae")).stated
-    views, speed = list(left.cameras), None
-    if video and path is not None and path.is_file() and path.suffix.lower() == ".json":
-        views, speed = read_cameras(path, left)  # the speed of a camera path
+    check_file(out, reads=[scene, advanced.cameras], overwrite=advanced.overwrite)
+    edit = opened(scene, wishes, advanced, most=MOST_CAMERAS)
+    left, speed = edit.reduced(Path("scene.sundae")).stated, edit.speed
+    views = list(left.cameras)
     if seconds is not None and (speed is not None or not video):
         raise ConfigError("--seconds is the length of a film without a camera path; leave it out")
     if video and speed is None:
         with Console(stderr=True).status("Finding a path"):
             views = film_views(left, seconds=12.0 if seconds is None else seconds, frames_per_second=fps or 24)
-    elif (view is None and path is None) or not views:
+    elif (view is None and advanced.cameras is None) or not views:
         views = [start] if (start := opening(left).start) is not None else views
     views = [each if width is None else each.zoomed(width / each.width) for each in views]
     left = left.to(fastest_device())

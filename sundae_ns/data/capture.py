@@ -61,14 +61,14 @@ def rigid(pose: np.ndarray, where: str) -> np.ndarray:
     return pose if abs(scale - 1) <= 1e-3 else np.hstack([pose[:, :3] / scale, pose[:, 3:]])  # rounded ones stay
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """The JSON object of a file; ``DataError`` if it cannot be read or holds none."""
+def read_json(path: Path, *, slashes: bool = True) -> dict[str, Any]:
+    """The JSON object of a file, with ``slashes`` in Windows paths; ``DataError`` if it cannot be read or is none."""
     with reading(path, "JSON", remedy="write it again"):
         with regular(path).open("rb") as file:
             text = file.read(_MOST_BYTES + 1)
         if len(text) > _MOST_BYTES or sum(map(text.count, b"[{:")) > 2_000_000:
             raise DataError(f"{path} has more than 32 MB, or two million lists and entries; split it")
-        content = json.loads(text.replace(rb"\\", b"/"))  # paths of Windows
+        content = json.loads(text.replace(rb"\\", b"/" if slashes else rb"\\"))
     if not isinstance(content, dict):
         raise DataError(f"{path} does not hold a JSON object; give the transforms.json of a capture")
     return content

@@ -19,7 +19,7 @@ from sundae_ns.core.files import write_text
 from sundae_ns.data.capture import read_json
 from sundae_ns.data.images import JPEG, check_image, decoded, decoded_mask
 from sundae_ns.data.layouts import LONGEST_SIDE
-from sundae_ns.data.photos import LEAST_PHOTOS, Photo, upright, usable
+from sundae_ns.data.photos import LEAST_PHOTOS, Photo, Warn, upright, usable
 
 TRANSFORMS = "transforms.json"
 MARKER = ".sundae_scene"  # in a copy of the demo's capture; it permits to replace it
@@ -79,9 +79,7 @@ def names_of(photos: Sequence[Photo]) -> list[str]:
     return [name + photo.suffix for name, photo in zip(names, photos, strict=True)]
 
 
-def write_images(
-    photos: Sequence[Photo], folder: Path, warn: Callable[[str], Any], advance: Advance
-) -> dict[str, Photo]:
+def write_images(photos: Sequence[Photo], folder: Path, warn: Warn, advance: Advance) -> dict[str, Photo]:
     """Write the photos, upright and in sRGB, unless their images exist; those :func:`.usable`, by their images."""
 
     def write(item: tuple[str, Photo]) -> tuple[str, Photo]:

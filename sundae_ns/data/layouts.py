@@ -77,10 +77,8 @@ def _colmap_layout(data: Path, model: str, num_models: int) -> Layout:
     path = [] if folder == "images" else ["--images-path", folder]
     several = f", the largest of {num_models} models" if num_models > 1 else ""
     smaller = f", at 1/{downscale} of their size" if downscale > 1 else ""
-    return Layout(
-        f"COLMAP layout: {len(names):,} images in {folder}{smaller}, poses of {model}{several}",
-        ["colmap", "--colmap-path", model, *path, "--downscale-factor", str(downscale)],
-    )
+    description = f"COLMAP layout: {len(names):,} images in {folder}{smaller}, poses of {model}{several}"
+    return Layout(description, ["colmap", "--colmap-path", model, *path, "--downscale-factor", str(downscale)])
 
 
 def _blender_layout(data: Path) -> Layout:
@@ -88,12 +86,12 @@ def _blender_layout(data: Path) -> Layout:
     for split in ("train", "val", "test"):
         if not (path := data / f"transforms_{split}.json").exists():
             raise DataError(f"{path} does not exist{beside(path)}, which Blender's layout needs; copy another split's")
-        frames = read_json(path).get("frames")
-        if b"\\\\" in path.read_bytes():
-            raise DataError(f"{path} has paths of Windows, which nerfstudio does not find here; write / in place of \\")
+        frames = read_json(path, slashes=False).get("frames")
         named = isinstance(frames, list) and all(isinstance(frame, dict) and "file_path" in frame for frame in frames)
         if not frames or not named:
             raise DataError(f"{path} lists no frames with a file_path; export it again")
+        if any("\\" in str(frame["file_path"]) for frame in frames):
+            raise DataError(f"{path} has paths of Windows, which nerfstudio does not find here; write / in place of \\")
         lists.append(frames)
     check_image(data / f"{lists[0][0]['file_path']}.png")
     description = f"Blender layout: {len(lists[0]):,} training images, over white"  # as nerfstudio puts them

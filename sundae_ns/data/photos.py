@@ -17,18 +17,18 @@ from PIL import ExifTags, Image
 
 from sundae_ns.core.errors import DataError, reading, regular
 from sundae_ns.data import images
-from sundae_ns.data.images import HEIF, REPAIR, TURNED, check_image, opened, orientation_in, reads_heif
 from sundae_ns.data.layouts import LONGEST_SIDE
 from sundae_ns.data.lenses import kind_of_model
 
 RAW = ".cr2"  # of Canon, which Pillow does not read
-SUFFIXES = (".jpg", ".jpeg", ".jfif", ".jpe", ".png", ".tif", ".tiff", ".webp", ".bmp", *HEIF, RAW)
+SUFFIXES = (".jpg", ".jpeg", ".jfif", ".jpe", ".png", ".tif", ".tiff", ".webp", ".bmp", *images.HEIF, RAW)
 _OTHERS = tuple(".avif .jxl .jp2 .dng .nef .nrw .arw .cr3 .raf .orf .rw2 .pef .srw .exr .gif".split())  # are not read
 LEAST_PHOTOS = 3  # with a pose that a scene needs, because nerfstudio holds out at least one for test
 # Suffix in a capture by Pillow's format (phones write MPO, several JPEG images); others become JPEG, with alpha PNG.
 _COPIED = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}
 _CONVERTED = ("TIFF", "WEBP", "BMP", "HEIF")
 _MASKS = ("masks", "mask")  # names of folders whose images are masks
+Warn = Callable[[str], object]  # called with a remark in one line
 
 
 class Photo(NamedTuple):
@@ -41,13 +41,13 @@ class Photo(NamedTuple):
     lens: tuple[str, ...]  # camera, lens and focal length by EXIF: with the size, what tells cameras apart
 
 
-def find_photos(folder: Path, warn: Callable[[str], object] = str) -> list[Photo]:
+def find_photos(folder: Path, warn: Warn = str) -> list[Photo]:
     """The photos in a folder and its subfolders, sorted by path, judged by their headers.
 
     Hidden files and folders and those of masks are left out, and photos that cannot be read, with a line to ``warn``.
     """
     with reading(folder, "a folder of photos"):
-        suffixes = [suffix for suffix in SUFFIXES if suffix not in HEIF or reads_heif()]
+        suffixes = [suffix for suffix in SUFFIXES if suffix not in images.HEIF or images.reads_heif()]
         paths = sorted(path for path in _files(folder) if path.suffix.lower() in suffixes)
     if len(counts := Counter(path.parent for path in paths)) > 1 and folder not in counts:
         listed = ", ".join(f"{path.relative_to(folder)}: {count:,}" for path, count in list(counts.items())[:3])
@@ -75,7 +75,7 @@ def copies(paths: Iterable[Path]) -> dict[Path, Path]:
     return {copy: path for path, copy in pairwise(ordered) if filecmp.cmp(path, copy, shallow=False)}
 
 
-def usable(items: Sequence[Any], use: Callable[[Any], Any], warn: Callable[[str], object]) -> Iterator[Any]:
+def usable(items: Sequence[Any], use: Callable[[Any], Any], warn: Warn) -> Iterator[Any]:
     """Results of ``use``, without up to half and 100 that raise a ``DataError``."""
     errors = 0
     for item in items:
@@ -90,13 +90,13 @@ def usable(items: Sequence[Any], use: Callable[[Any], Any], warn: Callable[[str]
 
 def left_out(folder: Path) -> str | None:
     """A remark on photos of other formats in a folder; None without any."""
-    unread = _OTHERS if reads_heif() else (*_OTHERS, *HEIF)
+    unread = _OTHERS if images.reads_heif() else (*_OTHERS, *images.HEIF)
     if not (counts := Counter(suffix for path in _files(folder) if (suffix := path.suffix.lower()) in unread)):
         return None
     listed = ", ".join(f"{count} {suffix}" for suffix, count in sorted(counts.items()))
     convert = "convert them to JPEG (`magick mogrify -format jpg FILES`, or export them as JPEG)"
     install = 'install pillow-heif with pip install "sundae_ns[photos]"'
-    return f"{listed} left out; {install if counts.keys() <= set(HEIF) else convert}"
+    return f"{listed} left out; {install if counts.keys() <= set(images.HEIF) else convert}"
 
 
 def masks_beside(folder: Path) -> Path | None:
@@ -107,14 +107,14 @@ def masks_beside(folder: Path) -> Path | None:
 
 def upright(photo: Photo) -> tuple[Image.Image, Image.Exif]:
     """The upright pixels of a photo in sRGB, and its EXIF data; ``DataError`` if they are broken."""
-    with reading(photo.path, "a photo that can be decoded", remedy=REPAIR, missing=REPAIR):
+    with reading(photo.path, "a photo that can be decoded", remedy=images.REPAIR, missing=images.REPAIR):
         if photo.path.suffix.lower() == RAW:
-            with importlib.import_module("rawpy").imread(str(regular(photo.path))) as raw:  # comes with nerfstudio
+            with _opened_raw(photo.path) as raw:
                 return Image.fromarray(raw.postprocess()), Image.Exif()
-        with opened(photo.path) as image:
+        with images.opened(photo.path) as image:
             image.load()
             exif = image.getexif()
-            pixels = images.turned(images.to_srgb(image), orientation_in(image))
+            pixels = images.turned(images.to_srgb(image), images.orientation_in(image))
         exif.pop(ExifTags.Base.Orientation, None)
         for name in (ExifTags.IFD.Interop, ExifTags.Base.ColorSpace):  # which may say Adobe RGB
             exif.get_ifd(ExifTags.IFD.Exif).pop(name, None)
@@ -132,23 +132,27 @@ def _files(folder: Path) -> Iterator[Path]:
 
 def photo_of(path: Path) -> Photo:
     """A photo, after a check of its header; ``DataError`` if the file is none, or of a format that is not read."""
-    with reading(path, "a photo", remedy=REPAIR, missing=REPAIR):
+    with reading(path, "a photo", remedy=images.REPAIR, missing=images.REPAIR):
         if path.suffix.lower() == RAW:
-            with importlib.import_module("rawpy").imread(str(regular(path))) as raw:
+            with _opened_raw(path) as raw:
                 size = raw.sizes.iwidth, raw.sizes.iheight
                 return Photo(path, ".jpg", size[::-1] if raw.sizes.flip in (5, 6) else size, False, (RAW,))
-        size = check_image(path)
-        with opened(path) as image:
+        size = images.check_image(path)
+        with images.opened(path) as image:
             kind, alpha, exif = str(image.format), image.has_transparency_data, image.getexif()
-            orientation, lens, srgb = orientation_in(image), _lens(exif), images.is_srgb(image)
+            orientation, lens, srgb = images.orientation_in(image), _lens(exif), images.is_srgb(image)
             told = f"{image.info.get('xmp')} {lens}".upper()
             kind_of_model(next((key for key in ("EQUIRECTANGULAR", "CYLINDRICAL") if key in told), "OPENCV"), str(path))
     if kind not in (*_COPIED, *_CONVERTED):
         raise DataError(f"{path} is a {kind} file by its contents; save it as JPEG or PNG, or remove it")
     check_shape(path, size)
     suffix = _COPIED.get(kind, ".png" if alpha else ".jpg")
-    size = size[::-1] if orientation in TURNED else size
+    size = size[::-1] if orientation in images.TURNED else size
     return Photo(path, suffix, size, kind in _COPIED and orientation == 1 and srgb, lens)
+
+
+def _opened_raw(path: Path) -> Any:
+    return importlib.import_module("rawpy").imread(str(regular(path)))  # comes with nerfstudio
 
 
 def check_shape(path: Path, size: tuple[int, int]) -> None:
@@ -176,9 +180,9 @@ def masks_of(photos: Sequence[Photo], folder: Path) -> list[Path]:
             raise DataError(f"{path} has no mask {path.stem}.png in {folder}; add it, white where pixels count")
         if mask in masks:
             raise DataError(f"{path} and another photo have one mask, {mask}; put masks into folders as the photos are")
-        size, orientation = check_image(mask, mask=True), images.exif_orientation(path)
+        size, orientation = images.check_image(mask, mask=True), images.exif_orientation(path)
         # A mask of the upright size is upright; where both sizes are the same, nothing says so.
-        known = orientation == 1 or (orientation in TURNED and size == wanted != size[::-1])
+        known = orientation == 1 or (orientation in images.TURNED and size == wanted != size[::-1])
         if not known or images.exif_orientation(mask) != 1:
             raise DataError(f"{path} or its mask is turned by its EXIF entry, and the other is not; save both upright")
         if size != wanted:

@@ -23,7 +23,7 @@ from sundae_ns.core.errors import ConfigError, DataError, writing
 from sundae_ns.core.files import flush, write_text
 from sundae_ns.data.capture_files import TRANSFORMS, Advance, Placed, placed_in, write_capture, write_images
 from sundae_ns.data.layouts import LONGEST_SIDE
-from sundae_ns.data.photos import LEAST_PHOTOS, find_photos, masks_of
+from sundae_ns.data.photos import LEAST_PHOTOS, Warn, find_photos, masks_of
 from sundae_ns.data.video import is_video, write_frames
 from sundae_ns.io.run_folder import reserve
 
@@ -77,7 +77,7 @@ def threads() -> int:
     return int(stated) if stated.isdecimal() and int(stated) > 0 else (os.cpu_count() or 1)
 
 
-def find_poses(request: Request, report: Reporter, warn: Callable[[str], object] = print) -> Placed:
+def find_poses(request: Request, report: Reporter, warn: Warn = print) -> Placed:
     """Make a capture; continue what an earlier process has begun with the same photos and options."""
     work, video = request.work, is_video(request.photos)
     images, frames, made = work / "images", work / "frames", work / "capture"

@@ -135,7 +135,7 @@ def test_too_few_photos_and_folders_that_are_none(photos):
     ],
 )
 def test_photos_that_are_not_read_are_named(photos, monkeypatch, capsys, names, heif, remark):
-    monkeypatch.setattr(module, "reads_heif", lambda: heif)
+    monkeypatch.setattr(module.images, "reads_heif", lambda: heif)
     monkeypatch.setattr(reconstruct, "check_installed", lambda: None)
     assert left_out(photos) is None
     for name in names:
