@@ -305,12 +305,9 @@ def _check_tensors(loaded: Any) -> None:
 def random_state() -> dict[str, Any]:
     """State of all random generators that training uses, as plain numbers and tensors."""
     kind, keys, position, has_gauss, gauss = np.random.get_state()
-    return {
-        "python": random.getstate(),
-        "numpy": (str(kind), [int(key) for key in keys], int(position), int(has_gauss), float(gauss)),
-        "torch": torch.get_rng_state(),
-        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
-    }
+    plain = str(kind), [int(key) for key in keys], int(position), int(has_gauss), float(gauss)
+    cuda = torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
+    return {"python": random.getstate(), "numpy": plain, "torch": torch.get_rng_state(), "cuda": cuda}
 
 
 def set_random_state(state: Mapping[str, Any]) -> None:

@@ -210,11 +210,14 @@ def _index(value: object) -> int:
 def _local_transforms(nodes: list[Json]) -> Transforms:
     """Transforms ``[N, 4, 4]`` of nodes to the coordinates of their parents."""
     parts = {}
-    for name, usual in {"translation": [0] * 3, "rotation": [0, 0, 0, 1], "scale": [1] * 3, "matrix": [0] * 16}.items():
+    of_parent: dict[str, list[float]] = {"translation": [0] * 3, "rotation": [0, 0, 0, 1], "scale": [1] * 3}
+    for name, usual in (*of_parent.items(), ("matrix", np.eye(4).ravel().tolist())):
         parts[name] = np.array([node.get(name, usual) for node in nodes], np.float64)
         if parts[name].shape[1:] != (len(usual),) or not np.isfinite(parts[name]).all():
             raise ValueError(f"the {name} of a node is not {len(usual)} numbers")
     matrices = parts.pop("matrix").reshape(-1, 4, 4).transpose(0, 2, 1)
+    if (matrices[:, 3] != (0, 0, 0, 1)).any():
+        raise ValueError("the last row of a node's matrix is not 0 0 0 1: exchange its rows and columns")
     return np.where([[["matrix" in node]] for node in nodes], matrices, _transforms(parts))
 
 

@@ -67,7 +67,7 @@ _MARKS = [
     ("antialiased", r"\W*(?:splat.?)?(?:render|rast\w+).?mode\W*([\w.]*)(?:\W.*)?"),
     ("antialiased", r"\W*(?:(?:mip.?)?(?:anti.?alias\w*|splatting)|train.flags)\W*([\w.]*)(?:\W.*)?"),
     ("up", r"(?:vertical|(?:world|scene|axis)?[ _-]?up)[ _-]?(?:axis|vec(?:tor)?|dir(?:ection)?)?\s*[:= ]\s*(.+)"),
-    ("up", r"(?:\w+ systems?\W+|axes\W+)?([+-]?[xyz])[ _-]up(?:\W.*)?"),
+    ("up", r"(?:(?:\w+ systems?|axes|orientation|\w+.hand(?:ed)?)[^\w+-]+)*([+-]?[xyz])(?: is)?[ _-]up(?:\W.*)?"),
     ("offset", r"offset\s*[:=]?\s*(.+)"),
 ]
 ANTIALIASED = "mip mipsplatting antialiased antialiasing 1 1.0 true yes on enabled".split()  # values of a mark
@@ -193,7 +193,7 @@ def keep_vertices(
 def _header(path: Path) -> bytes:
     """The header of a .ply with the end of its last line; empty if it has none. ``OSError`` if it cannot be read."""
     with regular(path).open("rb") as file:
-        begin = file.read(1 << 16)
+        begin = file.read(1 << 20)
     first = re.match(rb"ply[ \t]*(\r\n|\r|\n)", begin)
     end = first and re.search(first[1] + rb"end_header[ \t]*" + first[1], begin)  # a comment may contain the word
     return begin[: end.end()] if end else b""
@@ -228,8 +228,9 @@ class _Ply:
                 self.elements[name] = start, rows, np.dtype(columns)
                 start += rows * (1 if self.text else self.elements[name][2].itemsize)
                 least += rows * (2 * len(columns) if self.text else self.elements[name][2].itemsize)
-            available = path.stat().st_size - len(self.header)
-            if not self.header.startswith(b"ply") or least > available:
+            if not self.header:
+                raise ValueError("it does not begin with ply, or has no end_header in its first megabyte")
+            if least > (available := path.stat().st_size - len(self.header)):
                 raise ValueError(f"its header states at least {least:,} bytes, it has {available:,}")
             if "vertex" not in self.elements:
                 raise DataError(f"{path} has no vertices; give a .ply of points or of Gaussians.")
@@ -302,7 +303,7 @@ def comments_of(marks: Marks) -> list[str]:
     return comments + [f"{name}: {' '.join(f'{x:.17g}' for x in v)}" for name, v in vectors.items() if v is not None]
 
 
-def _columns(rows: Any, names: Sequence[str], dtype: type[np.floating[Any]] = np.float32) -> Tensor:
+def _columns(rows: Any, names: Sequence[str], dtype: Any = np.float32) -> Tensor:
     """Properties of vertices as columns ``[N, len(names)]``."""
     table = np.empty((len(rows), len(names)), dtype)
     for i, name in enumerate(names):
@@ -340,7 +341,7 @@ def read_ply(path: Path) -> dict[str, Tensor]:
     if degree is None or not present.issuperset(f"f_rest_{i}" for i in range(rest)):
         raise DataError(f"{path} has {rest} f_rest properties, which fit no SH degree; export it again.")
     params = {name: _columns(rows, names) for name, names in columns.items() if name != "means"}
-    params["means"] = _columns(rows, columns["means"], np.float64 if rows["x"].dtype.itemsize == 8 else np.float32)
+    params["means"] = _columns(rows, columns["means"], np.result_type(np.float32, *(rows[x].dtype for x in "xyz")))
     alphas, wide = params["opacities"], (params["scales"] > 0).all()
     # No real scene has such logarithms and logits throughout.
     if len(rows) > 99 and bool(((alphas - 0.5).abs() <= 0.5).all() & (wide | (alphas.max() - alphas.min() > 0.5))):
@@ -390,6 +391,8 @@ def _decompressed(chunks: NDArray[Any], vertices: NDArray[Any], harmonics: NDArr
     rest = np.stack([harmonics[name] for name in names], axis=1) if names else np.zeros((n, 0), np.uint8)
     if rest.shape[1] % 3 or sh_degree_of(rest.shape[1] // 3) is None:
         raise ValueError(f"{rest.shape[1]} coefficients fit no SH degree")
+    if rest.dtype != np.uint8 or any(vertices[name].dtype.kind not in "iu" for name in _PACKED):
+        raise ValueError("its words or its coefficients are of another type, whose numbers have no meaning here")
     levels = np.where(rest == 0, 0, np.where(rest == 255, 1, (rest + np.float32(0.5)) / 256))
     values: dict[str, NDArray[Any]] = {
         "means": between(_ratios(vertices["packed_position"], (11, 10, 11)), "", "xyz"),

@@ -192,7 +192,7 @@ def read_sog(path: Path) -> tuple[dict[str, Tensor], Marks]:
 
 def _scene(path: Path, entry: Entry, size: int) -> tuple[dict[str, Tensor], Marks]:
     meta = parsed_json(entry(META))
-    if (version := str(meta.get("version", 1))) != "2":
+    if (version := meta.get("version", 1)) not in (2, "2"):
         raise DataError(f"{path} has version {version} of the format; convert it with splat-transform to version 2")
     up, offset = (vector(" ".join(map(str, meta.get(name, ())))) for name in ("up", "offset"))
     antialiased = any(str(meta.get(name)).lower() in ANTIALIASED for name in ("antialias", "model"))
@@ -201,7 +201,7 @@ def _scene(path: Path, entry: Entry, size: int) -> tuple[dict[str, Tensor], Mark
 
 def _finest_level(path: Path, entry: Entry, size: int) -> tuple[dict[str, Tensor], Marks]:
     meta = parsed_json(entry(STREAMED))
-    if (version := str(meta.get("version", 1))) != "1":
+    if (version := meta.get("version", 1)) not in (1, "1"):
         raise DataError(f"{path} has version {version} of streamed SOG, this program reads 1; update it")
     files: dict[str, list[tuple[int, int]]] = {}  # offset and number of the rows of each leaf
     nodes = [meta["tree"]]
@@ -270,6 +270,8 @@ def _decoded(file: Entry, meta: Mapping[str, Any], size: int) -> dict[str, Tenso
         return _pixels(file(entry["files"][index]), n).reshape(-1, 4)[:n, :channels]
 
     low, high = (np.asarray(meta["means"][end], np.float64) for end in ("mins", "maxs"))
+    if n != float(meta["count"]) or {low.shape, high.shape} != {(3,)}:
+        raise ValueError("its count is no whole number, or mins and maxs of its means are not three numbers each")
     levels = pixels(meta["means"], 0, 3) + 256.0 * pixels(meta["means"], 1, 3)
     bent = low + levels / _LEVELS * (high - low)
     color = pixels(meta["sh0"], 0, 4)

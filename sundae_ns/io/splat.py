@@ -71,7 +71,8 @@ def read_splat(path: Path) -> dict[str, Tensor]:
     """
     with reading(path, "a complete .splat"):
         rows = np.frombuffer(content := regular(path).read_bytes(), _SPLAT)
-        if (content.isascii() and content) or (rows["widths"] < 0).any():
+        begin = content[: 1 << 16]
+        if (begin and begin.decode(errors="ignore").encode() == begin) or (rows["widths"] < 0).any():
             raise ValueError("it is text, or has negative widths")
     return _gaussians(rows, rows["means"], (rows["quats"].astype(np.float32) - 128) / 128, np.zeros((len(rows), 0, 3)))
 
@@ -145,12 +146,14 @@ def _trained(loaded: Any) -> dict[str, Tensor]:
     splats = loaded.get("splats") if isinstance(loaded, dict) else None
     if not isinstance(splats, Mapping):
         raise ValueError("it holds no splats")
-    missing = [name for name in _GSPLAT_NAMES.values() if not isinstance(splats.get(name), Tensor)]
+    given = {name: value for name, value in splats.items() if isinstance(value, Tensor) and value.is_floating_point()}
+    missing = [name for name in _GSPLAT_NAMES.values() if name not in given]
     if missing and isinstance(splats.get("colors"), Tensor):
         raise ValueError("its colours need a network (app_opt); train with SH colours")
     if missing:
-        raise ValueError(f"its splats lack {', '.join(missing)}")
-    gaussians = {ours: splats[theirs].detach().float() for ours, theirs in _GSPLAT_NAMES.items()}
+        raise ValueError(f"its splats lack {', '.join(missing)}, or they are no floating-point numbers")
+    gaussians = {ours: given[theirs].detach().float() for ours, theirs in _GSPLAT_NAMES.items()}
+    gaussians["means"] = given["means"].detach().double()  # for survey coordinates
     gaussians["features_dc"] = gaussians["features_dc"].flatten(1)
     gaussians["opacities"] = gaussians["opacities"].reshape(-1, 1)
     check_gaussians(gaussians, ValueError)

@@ -118,7 +118,7 @@ DAMAGED = {
         "is a web page; download the f",
     ),
     "an image": ("a.splat", lambda path: path.write_bytes(b"\xff\xd8\xff\xe1" * 16), "has negative widths"),
-    "another text": ("a.splat", lambda path: path.write_text(64 * "a"), "it is text"),
+    "another text": ("a.splat", lambda path: path.write_text(32 * "ä"), "it is text"),
     "a pointer of Git LFS": (
         "a.ply",
         lambda path: path.write_text("version https://git-lfs.github.com/"),
@@ -138,6 +138,8 @@ DAMAGED = {
     "no harmonics": ("a.pt", _saved(means=torch.zeros(3, 3)), "its splats lack scales, quats, sh0, shN, opacities"),
     "colours of a network": ("a.pt", _saved(colors=torch.zeros(3, 3)), "its colours need a network"),
     "an odd shape": ("a.pt", lambda path: write_gsplat(path, FIELD | {"scales": FIELD["quats"]}), "scales has shape"),
+    "words of floats": ("a.ply", _renamed(b"uint packed_scale", b"float packed_scale"), "are of another type"),
+    "complex": ("a.pt", lambda path: write_gsplat(path, FIELD | {"scales": 1j * FIELD["scales"]}), "lack scales, or"),
     "sparse": ("a.pt", _saved(means=torch.zeros(3, 3).to_sparse()), "sparse"),
     "a missing file": ("a.splat", lambda _: None, "cannot be read"),
     "NaN": ("a.splat", lambda path: write_splat(path, FIELD | {"means": NAN}), "300 Gaussians, and none is finite"),

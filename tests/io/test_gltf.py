@@ -216,7 +216,7 @@ HOSTILE = {
     "a negative node": ({"scenes/0/nodes": [-1]}, "-1 is no index"),
     "a stretch": ({"nodes/0/scale": [1, 2, 1]}, "a node stretches"),
     "a small stretch": ({"nodes/0/scale": [1e-6, 2e-6, 1e-6]}, "a node stretches"),
-    "a matrix of nothing": ({"nodes/0/matrix": [0] * 16}, "a node stretches"),
+    "a matrix by rows": ({"nodes/0/matrix": [1, 0, 0, 5, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}, "last row of a node's"),
     "a matrix of words": ({"nodes/0/matrix": ["x"] * 16}, "could not convert string"),
     "a matrix of NaN": ({"nodes/0/matrix": [math.nan] * 16}, "the matrix of a node is not 16 numbers"),
     "a short translation": ({"nodes/0/translation": [1]}, "the translation of a node is not 3 numbers"),

@@ -157,7 +157,7 @@ def test_2dgs_is_flat_and_opacities_of_bytes_are_shares(tmp_path):
 ANTIALIASED = """anti-aliased = on|AntiAliasing: 1.0|antialias: yes|Antialiased|rasterize_mode mip|--antialiasing|\
 train_flags: --antialiasing --eval|antialiasing = True # 3dgs|mip-splatting: 1|SplatRenderMode: MipSplatting"""
 UPWARDS = """up: 0 0 2|upAxis=Z|Up vector [0, 0, 1]|UP_DIRECTION (0; 0; 1)|vertical axis: z-up|world_up 0 0 1 (ENU)|\
-z-up|Vertical axis: z (x east, y north)|up_axis: "z"|Coordinate system: Z up, right-handed|worldUpVec=0,0,1"""
+z-up|Vertical axis: z (x east, y north)|up_axis: "z"|Coordinate system: Z up, right-handed|axes: right-hand, +z is up"""
 ALL_MARKS = Marks(True, True, (0.6, 0.0, 0.8), (1e6 / 3, 0.1, -4e6))
 
 
@@ -175,7 +175,7 @@ ALL_MARKS = Marks(True, True, (0.6, 0.0, 0.8), (1e6 / 3, 0.1, -4e6))
         (["antialiased 0", "SplatRenderMode: 2dgs", "antialiased edges are nice"], Marks()),
         (["Vertical axis: 0 -2 0"], Marks(up=(0.0, -1.0, 0.0))),
         (["vertical AXIS: 3, 0, 4"], Marks(up=(0.6, 0.0, 0.8))),
-        (["Vertical axis: -y"], Marks(up=(0.0, -1.0, 0.0))),
+        *(([mark], Marks(up=(0.0, -1.0, 0.0))) for mark in ("Vertical axis: -y", "axes: -y up")),
         *(([mark], Marks(up=(0.0, 0.0, 1.0))) for mark in UPWARDS.split("|")),
         (["up to 3 0 0", "Updated: 0 0 1"], Marks()),
         (["Exported from Brush", "Vertical axis: y"], Marks(up=(0.0, -1.0, 0.0))),
@@ -217,7 +217,7 @@ WRONG = {
     "gone": (lambda path: path.unlink(), "cannot be read"),
     "a folder": (lambda path: (path.unlink(), path.mkdir()), "cannot be read"),
     "truncated": (lambda path: path.write_bytes(path.read_bytes()[:-5]), "not a complete"),
-    "empty": (lambda path: path.write_bytes(b""), "not a complete"),
+    "empty": (lambda path: path.write_bytes(b""), "not a complete .* .it does not begin with ply"),
     "an image": (lambda path: path.write_bytes(b"\x89PNG\r\n\x1a\n\xff\xfe" * 9), "not a complete"),
     "no vertices": (lambda path: path.write_bytes(b"ply\nformat ascii 1.0\nend_header\n"), "no vertices"),
     "no opacity": (_without("opacity"), "lacks opacity"),

@@ -262,6 +262,8 @@ HOSTILE = {
     "many chunks of few bytes": (_many_chunks, "would unpack to"),
     "deep JSON": (_with("meta.json", b"[" * 999_999), "recursion"),
     "fewer than no Gaussians": (_meta(count=-5), "it states -5 Gaussians"),
+    "half a Gaussian": (_meta(count=100.5), "count is no whole number"),
+    "one bound for all axes": (_meta(means={"mins": [0.0], "maxs": [1.0], "files": MEANS}), "three numbers each"),
     "endless Gaussians": (_meta(count=math.inf), "infinity"),
     "an outside file": (_meta(quats={"files": ["../../etc/passwd"]}), "no item named"),
     "a short codebook": (_meta(scales={"codebook": [0.0], "files": SCALES}), "out of bounds"),

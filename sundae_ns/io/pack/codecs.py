@@ -31,14 +31,8 @@ _UNIT = 127  # a basis is stored in these parts of a step
 _CHUNK, _PART = 1 << 16, 1 << 13  # rows expanded at once, and, as new memory takes a CPU long, transformed
 _LEAST_EIGENVALUE = 0.02  # of a form, relative to the mean: other cameras see more of these errors
 _LOGITS = (-6.0, 8.0)  # opacities outside look the same as at these: below 1/255 nothing is drawn
-_STEPS = {
-    "quats": "rotation_step",
-    "scales": "scale_step",
-    "opacities": "opacity_step",
-    "features_dc": "color_step",
-    "features_rest": "harmonics_step",
-    FEATURES: "feature_step",
-}  # options of the steps of attributes
+_STEPS = {"quats": "rotation_step", "scales": "scale_step", "opacities": "opacity_step"}  # options, by attribute
+_STEPS |= {"features_dc": "color_step", "features_rest": "harmonics_step", FEATURES: "feature_step"}
 _LARGEST_SHARE = 0.5  # step of an output channel of the head, at most, relative to its largest weight
 _RUN = 16  # neighbours on the curve whose levels share a mean and a magnitude, in the estimate of bits
 

@@ -199,16 +199,11 @@ def encode(meta: Mapping[str, Any], arrays: Mapping[str, Array], *, unpacked: in
         little[PADDING] = np.zeros(lacking, np.uint8)
         parts[PADDING] = [little[PADDING].tobytes()]
     stored = {name: b"".join(planes) for name, planes in parts.items()}
-    sections = [
-        {
-            "name": name,
-            "dtype": array.dtype.newbyteorder("<").str,
-            "shape": list(array.shape),
-            "parts": [len(part) for part in parts[name]],
-            "sha256": hashlib.sha256(stored[name]).hexdigest(),
-        }
-        for name, array in little.items()
-    ]
+    sections = []
+    for name, array in little.items():
+        about = {"name": name, "dtype": array.dtype.newbyteorder("<").str, "shape": list(array.shape)}
+        digest = hashlib.sha256(stored[name]).hexdigest()
+        sections.append({**about, "parts": [len(part) for part in parts[name]], "sha256": digest})
     content = b"".join([_front({**meta, "sections": sections}), *stored.values()])
     return content, {name: len(section) for name, section in stored.items()}
 

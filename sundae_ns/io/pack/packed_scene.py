@@ -73,8 +73,7 @@ class PackReport(NamedTuple):
     def summary(self) -> dict[str, Any]:
         """JSON values: Gaussians, bytes, and the bits per Gaussian of each attribute and of all."""
         bits = {**self.bits, "all": 8 * self.bytes / self.primitives}
-        rounded = {name: round(value, 2) for name, value in bits.items()}
-        return {"primitives": self.primitives, "bytes": self.bytes, "bits": rounded}
+        return {"primitives": self.primitives, "bytes": self.bytes, "bits": {k: round(v, 2) for k, v in bits.items()}}
 
 
 def _check(params: Mapping[str, Tensor]) -> None:
