@@ -24,6 +24,7 @@ _REASONS = {
     errno.EIO: "the disk reports an error; check it, or choose another disk",
     errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
     errno.EISDIR: "it is a folder; name a file",
+    errno.ENOENT: "a file or a folder is missing; check the path",
 }
 # What stands in the place of a file that was not fetched, by its first bytes.
 _STAND_INS = {b"version https://git-lfs": "is a pointer of Git LFS; fetch the file itself with `git lfs pull`"}

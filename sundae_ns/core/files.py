@@ -117,9 +117,8 @@ def write_video(path: Path, frames: Iterable[Image.Image], *, frames_per_second:
 
     count = -1
     with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as container:
-        stream = container.add_stream(
-            "libx264", rate=Fraction(frames_per_second).limit_denominator(1001), options={"crf": "18"}
-        )
+        rate = Fraction(frames_per_second).limit_denominator(1001)
+        stream = container.add_stream("libx264", rate=rate, options={"crf": "18"})
         stream.pix_fmt = "yuv420p"
         stream.codec_context.colorspace = 1  # BT.709; without it, players guess from the size
         for count, image in enumerate(frames):

@@ -74,7 +74,7 @@ def record(
     errors: list[RuntimeError] = []
     with _one_at_a_time, torch.cuda.device(device), _no_garbage_collection():
         generator = torch.cuda.default_generators[torch.cuda.current_device()]
-        before = generator.clone_state() if hasattr(generator, "clone_state") else None  # not in torch 2.1
+        before = generator.clone_state()
         try:
             # After a failed recording torch stays on its stream, and later work would not be ordered with gsplat's.
             with torch.cuda.stream(side):
@@ -92,9 +92,8 @@ def record(
                 with suppress(AttributeError, RuntimeError):
                     torch._C._cuda_endAllocateToPool(torch.cuda.current_device(), pool)
                 _abandoned.append(graph)
-                if before is not None:
-                    # Else torch refuses random numbers: its generator waits for a recording that does not exist.
-                    generator.graphsafe_set_state(before)
+                # Else torch refuses random numbers: its generator waits for a recording that does not exist.
+                generator.graphsafe_set_state(before)
             first = errors[0]
             if isinstance(first, torch.cuda.OutOfMemoryError):
                 raise first from None

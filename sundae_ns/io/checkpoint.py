@@ -76,8 +76,8 @@ def write(state: Mapping[str, Any], path: Path) -> None:
         with replacing(path, path.with_name(_PARTIAL.format(os.getpid()))) as partial, partial.open("wb") as file:
             torch.save(_compact(dict(state)), file)
     except OSError as error:
-        older = [other for other in checkpoints(path.parent) if other != path]
-        kept = f"{older[-1].name} is whole, resume from it with --load-dir" if older else "no older checkpoint"
+        step = newest_step(path.parent)
+        kept = "no older checkpoint" if step is None else f"the one of step {step} is whole, resume it with --load-dir"
         reason = str(error) if isinstance(error, StorageError) else f"cannot write {path}: {error.strerror or error}"
         raise StorageError(f"{reason} ({kept})") from error
 

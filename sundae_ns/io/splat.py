@@ -124,17 +124,18 @@ def _section(
     return _gaussians(rows, means, rows["quats"], rest), first + stored * kind.itemsize
 
 
-def read_gsplat(path: Path) -> dict[str, Tensor]:
-    """As :func:`read_splat`, a checkpoint of gsplat's trainer. No code in it runs.
+def rank_files(path: Path) -> list[Path]:
+    """Files of a checkpoint of gsplat: several GPUs write ``ckpt_29999_rank0.pt``, ``_rank1`` and so on."""
+    if (match := re.fullmatch(r"(.*_rank)\d+", path.stem)) is None:
+        return [path]
+    name = re.compile(re.escape(match[1]) + r"\d+")
+    return sorted(file for file in path.parent.glob("*.pt") if name.fullmatch(file.stem)) or [path]
 
-    Training on several GPUs spreads the Gaussians over ``ckpt_29999_rank0.pt``, ``_rank1`` and so on: all are read.
-    """
-    files = [path]
-    if match := re.fullmatch(r"(.*_rank)\d+", path.stem):
-        name = re.compile(re.escape(match[1]) + r"\d+")
-        files = sorted(file for file in path.parent.glob("*.pt") if name.fullmatch(file.stem)) or files
+
+def read_gsplat(path: Path) -> dict[str, Tensor]:
+    """As :func:`read_splat`, a checkpoint of gsplat's trainer, of all its ranks. No code in it runs."""
     parts = []
-    for each in files:
+    for each in rank_files(path):
         with reading(each, "a checkpoint of gsplat", remedy="give another file"), regular(each).open("rb") as file:
             check_whole(file)
             parts.append(_trained(load_tensors(file)))

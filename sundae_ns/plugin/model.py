@@ -38,21 +38,14 @@ from sundae_ns.plugin.viewer import ViewerControls, in_viewer
 from sundae_ns.rasterize.interface import select_backend
 from sundae_ns.rasterize.types import Backend
 from sundae_ns.scene.frames import FrameReplay, LazyOutputs, ShownResponse, empty_outputs, late_outputs
-from sundae_ns.scene.render import (
-    SHOWN_BACKGROUNDS,
-    GaussianSource,
-    RenderSettings,
-    StepResolution,
-    contribution,
-    render_view,
-)
+from sundae_ns.scene.render import SHOWN_BACKGROUNDS, GaussianSource, RenderSettings, contribution, render_view
 from sundae_ns.train.build import build
 from sundae_ns.train.curve import CurvePoint
 from sundae_ns.train.exposure import ExposureCompensation
 from sundae_ns.train.initialize import Start
 from sundae_ns.train.pruning import DROPPED, FEW_DROPPED, MANY_VIEWS, PruningConfig
 from sundae_ns.train.state import Callback, Photo, TrainingState
-from sundae_ns.train.step import StepInputs, StepLosses, training_part
+from sundae_ns.train.step import StepInputs, StepLosses, StepResolution, training_part
 from sundae_ns.train.trials import Trials
 
 _log = logging.getLogger(__name__)

@@ -23,8 +23,13 @@ from sundae_ns.pruning.floaters import STRENGTH, floater_odds
 from sundae_ns.scene.prune_scene import weights_in
 from sundae_ns.scene.scene import Scene, unit, usable_cameras, within
 
-HARDLY_SEEN = 0.17  # share below 1% of the mean weight: up to 0.10 in the captures tried, elsewhere from 0.27 on
-LEAST_SEEN = 0.92  # share of the Gaussians that the cameras of a prune see, else they may be in other coordinates
+_SIDE = 512  # longest side of the images that tell what is seen, pixels; the next two were measured with it
+_FAINT = 0.01  # weight as a share of the mean, below which a Gaussian is hardly seen; 0 tells captures apart less well
+HARDLY_SEEN = 0.17  # share of such Gaussians: up to 0.10 in the captures tried, in other coordinates from 0.27 on
+LEAST_SEEN = 0.92  # share of the Gaussians that cameras of a prune see, else they may be in other coordinates: a guess
+_SURE, _DOUBTFUL = 2.0, -6.0
+"""Logarithms of the least odds of a floater at strengths 0 and 1. By the root of the strength its default is half way,
+where ``benchmarks/results/cleaning.csv`` has 97% of the planted floaters."""
 OTHERS = "if the cameras are not in the coordinates of the scene, give those of its own run or capture"
 _log = logging.getLogger(__name__)
 
@@ -201,7 +206,7 @@ def crop_mask(scene: Scene, low: AnyArray, high: AnyArray) -> Tensor:
 
 def for_cleaning(cameras: Sequence[Camera]) -> list[Camera]:
     """The cameras with images of at most 512 pixels a side, which tell what is seen at all."""
-    return [camera.zoomed(min(512 / max(camera.width, camera.height), 1.0)) for camera in cameras]
+    return [camera.zoomed(min(_SIDE / max(camera.width, camera.height), 1.0)) for camera in cameras]
 
 
 @torch.no_grad()
@@ -213,11 +218,11 @@ def floater_mask(
         raise ConfigError(f"the strength of remove-floaters is {strength}; give 0 (careful) to 1 (thorough)")
     if not (sanitised := sanitise(scene.gaussians)).gaussians.num_gaussians:
         raise DataError("no Gaussian is finite; export the scene again")
-    floats = floater_odds(sanitised.gaussians) > 2 - 8 * strength**0.5  # logarithms
+    floats = floater_odds(sanitised.gaussians) > _SURE + (_DOUBTFUL - _SURE) * strength**0.5
     if cameras:
         usable = dataclasses.replace(scene, gaussians=sanitised.gaussians)
         weights = weights_in(usable, for_cleaning(cameras), console=console)
-        if (share := float((weights < 0.01 * weights.mean()).float().mean())) > HARDLY_SEEN:
+        if (share := float((weights < _FAINT * weights.mean()).float().mean())) > HARDLY_SEEN:
             _log.warning("the cameras hardly see %.0f%% of the Gaussians; %s", 100 * share, OTHERS)
         floats |= weights <= 0
     return ~within(sanitised.mask, ~floats)

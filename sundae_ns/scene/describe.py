@@ -21,6 +21,7 @@ from sundae_ns.head.head import bytes_of_module
 from sundae_ns.io.config_file import find_config
 from sundae_ns.io.formats import METAS, kind_of, kind_of_gaussians
 from sundae_ns.io.pack.container import read_header
+from sundae_ns.io.splat import rank_files
 from sundae_ns.scene.cameras import spread
 from sundae_ns.scene.compose import floater_mask, for_cleaning
 from sundae_ns.scene.page import opened_page
@@ -52,11 +53,13 @@ def write_preview(path: Path, before: Scene, after: Scene, cameras: Sequence[Cam
 
 
 def bytes_at(path: Path) -> int | None:
-    """Bytes of the file or the folder of a scene; None for a run, which holds more than that."""
-    if kind_of(path) is None and kind_of_gaussians(path) is None and find_config(path) is not None:
+    """Bytes of the files or the folder of a scene; None for a run, which holds more than that."""
+    kind = kind_of_gaussians(path)
+    if kind is None and kind_of(path) is None and find_config(path) is not None:
         return None
-    files = (path.parent if path.name in METAS else path).rglob("*")
-    return sum(file.stat().st_size for file in {path, *files} if file.is_file())
+    inside = (path.parent if path.name in METAS else path).rglob("*")
+    files = rank_files(path) if kind == "gsplat" else {path, *inside}
+    return sum(file.stat().st_size for file in files if file.is_file())
 
 
 @torch.no_grad()

@@ -91,7 +91,8 @@ def opened_page(page: Path) -> Iterator[Path]:
         text = page.read_text(encoding="utf-8").partition('class="scene"')[2].partition(">")[2].partition("<")[0]
         content = base64.b64decode(text or "?", validate=True)
     with TemporaryDirectory() as folder:
-        (packed := Path(folder, f"{page.stem}.sundae")).write_bytes(content)
+        packed = Path(folder, f"{page.stem}.sundae")
+        packed.write_bytes(content)
         yield packed
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -24,15 +24,6 @@ if TYPE_CHECKING:
 SHOWN_BACKGROUNDS = {"random": (0.1490, 0.1647, 0.2157), "black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 """Backgrounds of images that are not trained on, by the option ``background_color``; for random the viewer's."""
 NEAR_PLANE = 0.01  # distance of the near plane, world units
-
-
-class StepResolution(NamedTuple):
-    """Form of the training images at one step: a function of the step and the options."""
-
-    step: int
-    downscale: int  # Divisor of the sides of the images
-    window_pixels: int  # Most pixels of an image; larger images are trained on by a random window. 0 for no limit.
-    mirror: bool = False  # Whether half of the steps mirror their image
 
 
 @dataclass(frozen=True)

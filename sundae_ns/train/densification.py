@@ -13,6 +13,7 @@ import torch
 from gsplat.strategy import DefaultStrategy
 from torch import Tensor
 
+from sundae_ns.core.values import usual_defaults
 from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
 STATISTICS = ("grad2d", "count", "radii")  # Tensors [N] in the running state of gsplat's strategy
@@ -109,16 +110,12 @@ class Densification(Callback):
 
     def after_step(self, run: TrainingRun) -> None:
         """Let the strategy add, move and remove Gaussians."""
-        state, default = run.state, torch.get_default_dtype()
-        if not state.densifying:
-            return
-        torch.set_default_dtype(torch.float32)  # of the tensors that gsplat makes
-        try:
-            self.strategy.step_post_backward(
-                state.gaussians.data, state.optimizers, state.densification, state.schedule_step, state.info
-            )
-        finally:
-            torch.set_default_dtype(default)
+        state = run.state
+        if state.densifying:
+            with usual_defaults():  # of the tensors that gsplat makes
+                self.strategy.step_post_backward(
+                    state.gaussians.data, state.optimizers, state.densification, state.schedule_step, state.info
+                )
 
 
 def make_strategy(options: Any, num_images: int) -> CappedStrategy:

@@ -81,13 +81,11 @@ class Buffers:
 
 def start_moments(state: TrainingState, trained: tuple[str, ...]) -> None:
     """Make the state of Adam for parameters that have none, as its first step would."""
-    groups = [
-        (state.optimizers[name].state, group) for name in trained for group in state.optimizers[name].param_groups
-    ]
-    for states, value in [(states, value) for states, group in groups for value in group["params"]]:
-        if not states[value]:
-            states[value]["step"] = torch.zeros((), dtype=torch.float32, device=value.device)
-            states[value].update({moment: torch.zeros_like(value) for moment in MOMENTS})
+    for optimizer in (state.optimizers[name] for name in trained):
+        for value in (value for group in optimizer.param_groups for value in group["params"]):
+            if not (moments := optimizer.state[value]):
+                moments["step"] = torch.zeros((), dtype=torch.float32, device=value.device)
+                moments.update({name: torch.zeros_like(value) for name in MOMENTS})
 
 
 def trained_parameters(state: TrainingState) -> tuple[str, ...]:

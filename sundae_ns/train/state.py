@@ -62,8 +62,7 @@ class TrainingState:
     @property
     def device(self) -> torch.device:
         """Device of the field."""
-        device: torch.device = self.gaussians["means"].device
-        return device
+        return self.gaussians["means"].device
 
     @property
     def densifying(self) -> bool:

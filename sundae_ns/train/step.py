@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -24,7 +24,7 @@ from sundae_ns.cuda.kernels import kernels_where_possible
 from sundae_ns.cuda.loss import SIGMA, fused_loss, loss_kernels
 from sundae_ns.head.head import training_crop
 from sundae_ns.rasterize.types import Rasterization
-from sundae_ns.scene.render import GaussianSource, RenderSettings, StepResolution, render_view
+from sundae_ns.scene.render import GaussianSource, RenderSettings, render_view
 from sundae_ns.train.state import TrainingState
 
 LEAST_SQUARE = 1e-8  # Added to the mean square, so that its root has a gradient for equal images
@@ -199,6 +199,15 @@ class StepResult:
     images: dict[str, Tensor]  # rgb, base_rgb and accumulation, each [H, W, C]
     losses: dict[str, Tensor]  # Terms of the loss []
     loss: Tensor  # Their sum []
+
+
+class StepResolution(NamedTuple):
+    """Form of the training images at one step: a function of the step and the options."""
+
+    step: int
+    downscale: int  # Divisor of the sides of the images
+    window_pixels: int  # Most pixels of an image; larger images are trained on by a random window. 0 for no limit.
+    mirror: bool = False  # Whether half of the steps mirror their image
 
 
 def training_part(state: TrainingState, camera: Camera, at: StepResolution) -> tuple[Camera, Crop | None]:

@@ -197,10 +197,8 @@ class Trials(Callback):
         if not self.decides_head:
             return
         if not saved.get("head"):
-            raise CheckpointError(
-                "the checkpoint is of a run with head.mode residual, features or off; give this mode with "
-                "--pipeline.model.head.mode"
-            )
+            modes = "the checkpoint is of a run with head.mode residual, features or off"
+            raise CheckpointError(f"{modes}; give this mode with --pipeline.model.head.mode")
         head, trial = saved["progress"]["chosen"].get("head"), saved["engine"]["trial"]
         if head == "features" or (trial and trial["num_features"] == MORE_FEATURES):
             state.widen_head(MORE_FEATURES)
@@ -403,10 +401,8 @@ class Trials(Callback):
             self._try_length(run)
 
     def _announce(self, run: TrainingRun, question: str, trials: int, length: int, views: list[int]) -> None:
-        log.info(
-            f"step {run.state.step}: {question} Up to {trials} trials of {length:,} steps; {len(views)} of "
-            f"{len(run.view_indices())} training views are held out"
-        )
+        held_out = f"{len(views)} of {len(run.view_indices())} training views are held out"
+        log.info(f"step {run.state.step}: {question} Up to {trials} trials of {length:,} steps; {held_out}")
 
     def curve(self) -> list[CurvePoint]:
         """Expected quality over the counts that were tried, largest first, with a head if trials say that it pays."""

@@ -82,10 +82,12 @@ def test_what_is_not_whole_is_passed_over(tmp_path, harm):
 
 
 @pytest.mark.parametrize(
-    ("older", "remedy"), [((10,), rf"make room \({name(10)} is whole, resume from it"), ((), "no older checkpoint")]
+    ("older", "remedy"), [((10, 15), r"make room \(the one of step 10 is whole, "), ((), "no older checkpoint")]
 )
 def test_a_full_disk_leaves_the_older_checkpoint(tmp_path, monkeypatch, older, remedy):
     saved(tmp_path, *older)
+    for step in older[1:]:
+        flip(tmp_path / name(step))
 
     def full(state, file):
         file.write(b"half")
@@ -94,7 +96,7 @@ def test_a_full_disk_leaves_the_older_checkpoint(tmp_path, monkeypatch, older, r
     monkeypatch.setattr(torch, "save", full)
     with pytest.raises(StorageError, match=f"disk is full; [^\n]*{remedy}[^\n]*$"):
         saved(tmp_path, 20)
-    assert os.listdir(tmp_path) == [name(step) for step in older]
+    assert sorted(os.listdir(tmp_path)) == [name(step) for step in older]
 
 
 def test_nerfstudio_finds_its_newest_beside_a_killed_save(tmp_path):

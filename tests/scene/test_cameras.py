@@ -28,9 +28,9 @@ from sundae_ns.scene.cameras import is_frame, opening, read_cameras, with_start
 from sundae_ns.scene.packing import start_of, stated_start
 from sundae_ns.scene.page import render_first
 from sundae_ns.scene.prune_scene import prune_with_mask
-from sundae_ns.scene.render import StepResolution
 from sundae_ns.scene.scene import image_of
 from sundae_ns.scene.virtual_cameras import front_views
+from sundae_ns.train.step import StepResolution
 
 FRAME = {"transform_matrix": [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]}
 LENS = {"fl_x": 50, "fl_y": 60, "cx": 32, "cy": 24, "w": 64, "h": 48}

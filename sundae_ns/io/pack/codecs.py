@@ -378,10 +378,7 @@ class Codecs:
 
 
 def fit_codecs(
-    gaussians: Mapping[str, Tensor],
-    head: Mapping[str, Tensor],
-    config: PackConfig,
-    sensitivity: Sensitivity | None = None,
+    gaussians: Mapping[str, Tensor], head: Mapping[str, Tensor], config: PackConfig, sensitivity: Sensitivity | None
 ) -> tuple[dict[str, Tensor], Codecs]:
     """Gaussians in the stored order, with rounded positions, and codecs fitted to them and to a head; {} for none."""
     names = [name for name in (*SPLAT_NAMES, FEATURES) if name in gaussians]

@@ -146,7 +146,7 @@ def test_transform(kind, n, seed):
 def test_one_that_is_far_away_leaves_all_others_in_their_place():
     field = random_field(3000, degree=0)
     far = {**field, "means": field["means"].index_fill(0, torch.tensor([1500]), 1e6)}
-    found = module.fit_codecs(far, {}, PackConfig())[0]["means"]
+    found = module.fit_codecs(far, {}, PackConfig(), None)[0]["means"]
     assert (torch.cdist(field["means"], found).amin(dim=1) > 0.01).sum() < 16
 
 
