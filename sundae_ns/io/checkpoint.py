@@ -17,7 +17,7 @@ import random
 import re
 import zipfile
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from encodings import normalize_encoding
 from encodings.aliases import aliases
 from numbers import Integral
@@ -61,10 +61,8 @@ def folder_of(run: Path) -> Path:
 def newest_step(path: Path) -> int | None:
     """Step of a checkpoint by its name, or of the newest whole one of a run or its folder; None if there is none."""
     if not path.is_file():
-        try:
+        with suppress(CheckpointError):
             path, _ = newest_whole(path)
-        except CheckpointError:
-            return None
     return int(match[1]) if (match := _NAME.fullmatch(path.name)) else None
 
 

@@ -409,7 +409,8 @@ def _ratios(words: NDArray[Any], bits: tuple[int, ...]) -> NDArray[np.float32]:
     """Fields of 32-bit words, from the top bit down, relative to their largest value ``[N, len(bits)]``."""
     shifts = (32 - np.cumsum(bits)).astype(np.uint32)
     largest = ((1 << np.array(bits)) - 1).astype(np.uint32)
-    return ((words.astype(np.uint32)[:, None] >> shifts) & largest).astype(np.float32) / largest.astype(np.float32)
+    fields = (words.astype(np.uint32)[:, None] >> shifts) & largest
+    return fields.astype(np.float32) / largest.astype(np.float32)
 
 
 def from_smallest_three(others: NDArray[Any], largest: NDArray[Any]) -> NDArray[Any]:

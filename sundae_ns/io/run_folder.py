@@ -69,11 +69,9 @@ def reserve(run: Path, busy: str = "trains in {}; wait for it, or give another -
 
 def _in_training(run: Path) -> bool:
     """Whether a process has reserved the folder of a run."""
-    try:
-        with (run / LOCK).open(encoding="utf-8") as file:
-            return locked(file) is False
-    except OSError:
-        return False
+    with suppress(OSError), (run / LOCK).open(encoding="utf-8") as file:
+        return locked(file) is False
+    return False
 
 
 def prunes_of(run: Path) -> list[dict[str, Any]]:

@@ -70,7 +70,8 @@ def read_splat(path: Path) -> dict[str, Tensor]:
     coordinates. Log-scales of widths of 0 are infinite; see ``gaussians.sanitise``.
     """
     with reading(path, "a complete .splat"):
-        rows = np.frombuffer(content := regular(path).read_bytes(), _SPLAT)
+        content = regular(path).read_bytes()
+        rows = np.frombuffer(content, _SPLAT)
         begin = content[: 1 << 16]
         if (begin and begin.decode(errors="ignore").encode() == begin) or (rows["widths"] < 0).any():
             raise ValueError("it is text, or has negative widths")

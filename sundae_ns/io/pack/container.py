@@ -32,6 +32,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 from importlib import resources
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -195,7 +196,9 @@ def encode(meta: Mapping[str, Any], arrays: Mapping[str, Array], *, unpacked: in
     little = {name: array.astype(array.dtype.newbyteorder("<"), copy=False) for name, array in arrays.items()}
     parts = {name: [_deflated(plane) for plane in split_planes(array)] for name, array in little.items()}
     body = sum(len(part) for planes in parts.values() for part in planes)
-    if (lacking := (max(unpacked, sum(array.nbytes for array in little.values())) - SPARE) // MAX_RATIO + 1 - body) > 0:
+    unpacked = max(unpacked, sum(array.nbytes for array in little.values()))
+    lacking = (unpacked - SPARE) // MAX_RATIO + 1 - body
+    if lacking > 0:
         little[PADDING] = np.zeros(lacking, np.uint8)
         parts[PADDING] = [little[PADDING].tobytes()]
     stored = {name: b"".join(planes) for name, planes in parts.items()}
@@ -272,12 +275,11 @@ def read_sections(path: Path, header: Header) -> dict[str, Array]:
                 raise ValueError(f"the checksum of {section.name} is wrong")
             if section.size == 0 or section.name == PADDING:
                 return np.zeros(section.shape, section.dtype)
-            planes, start = [], section.offset
-            for part in section.parts:
-                planes.append(_inflated(content[start : start + part], section.size // len(section.parts)))
-                start += part
+            size, ends = section.size // len(section.parts), accumulate(section.parts)
+            planes = [_inflated(stored[end - part : end], size) for end, part in zip(ends, section.parts)]
             table = np.frombuffer(b"".join(planes), np.uint8).reshape(_rows(section.shape), section.dtype.itemsize, -1)
-            return np.ascontiguousarray(table.transpose(0, 2, 1)).reshape(-1).view(section.dtype).reshape(section.shape)
+            numbers = np.ascontiguousarray(table.transpose(0, 2, 1)).reshape(-1).view(section.dtype)
+            return numbers.reshape(section.shape)
 
         with ThreadPoolExecutor(2) as pool:
             arrays = dict(zip(header.sections, pool.map(decode, header.sections.values()), strict=True))
