@@ -16,15 +16,15 @@ from sundae_ns.report.measure import Subject
 if more := int(os.environ.get("TWICE", 0)):  # views that were held out come so many times more, once they are back
     from sundae_ns.plugin.datamanager import SundaeDatamanager
 
-    hold_back = SundaeDatamanager.hold_back
+    hold_out = SundaeDatamanager.hold_out
 
-    def hold_back_then_repeat(self, indices):
-        before = getattr(self, "holdout_indices", [])
-        hold_back(self, indices)
-        self.repeated = [*getattr(self, "repeated", []), *(more * [i for i in before if i not in self.holdout_indices])]
-        self._served += [i for i in self.repeated if i not in self.holdout_indices]
+    def hold_out_then_repeat(self, indices):
+        before = getattr(self, "held_out_indices", [])
+        hold_out(self, indices)
+        self.repeated = [*getattr(self, "repeated", []), *(more * [i for i in before if i not in self.held_out_indices])]
+        self._served += [i for i in self.repeated if i not in self.held_out_indices]
 
-    SundaeDatamanager.hold_back = hold_back_then_repeat
+    SundaeDatamanager.hold_out = hold_out_then_repeat
 
 capture, out, name, method, steps, *words = sys.argv[1:]
 job = few_job(capture, f"{Path(capture).name}-{name}", name, method, int(steps), words)

@@ -26,7 +26,7 @@ def measure_both(self, run):
     if stage == "length":
         pipeline = made["trainer"].pipeline
         with self._mean.shown(trials.weights_of(run.state)):
-            held = trials.measure_heldout(run, with_fitted=True)
+            held = trials.measure_held_out(run, with_fitted=True)
             test = pipeline.get_average_eval_image_metrics()
         rows.append({"step": run.state.schedule_step, "held": [list(view) for view in held], "test": {k: float(v) for k, v in test.items()}})
     return found

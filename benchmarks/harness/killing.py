@@ -93,7 +93,7 @@ TRAINING = {
 }
 TRIALS = {
     "trial: started": at(trials.Trials, "start", after, lambda n: n),
-    "trial: measuring": at(trials, "measure_heldout", before, lambda n: n),
+    "trial: measuring": at(trials, "measure_held_out", before, lambda n: n),
     "trial: back to the Gaussians before it": at(trials.Trials, "go_back", after),
     "trials: ended": at(trials.Trials, "end", after),
     **SAVES,

@@ -24,10 +24,9 @@ _WINDOWS = os.name == "nt"  # renames no open file, opens no folder, and flushes
 
 def locked(file: IO[Any]) -> bool | None:
     """Whether this process gets the lock of an open file until it ends; None if the file system has no locks."""
-    try:
+    with suppress(OSError):
         return lock_descriptor(file.fileno(), blocking=False)
-    except OSError:
-        return None
+    return None
 
 
 @contextmanager
@@ -84,8 +83,9 @@ def write_text(path: Path, text: str) -> None:
 
 def write_image(path: Path, image: Image.Image) -> None:
     """Write an image as :func:`write_bytes` does, in the format of its suffix."""
+    kind = path.suffix.lower()[1:]
     with replacing(path) as partial:
-        image.save(partial, format={"jpg": "jpeg"}.get(kind := path.suffix.lower()[1:], kind))
+        image.save(partial, format={"jpg": "jpeg"}.get(kind, kind))
 
 
 def put_aside(path: Path) -> None:

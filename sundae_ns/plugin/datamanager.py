@@ -156,7 +156,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             raise DataError(f"{asked}; {remedy}") from error
         except Exception as error:  # parsers raise many kinds, assertions too, with one meaning for the user
             raise DataError(f"{config.capture} cannot be parsed ({one_line(error)}); check the capture") from error
-        self.hold_back(())
+        self.hold_out(())
         self._cameras: dict[int, Cameras] = {}
         self.rank = 0  # Rank of this process: at a step, rank r trains on the view that one process takes r steps later
 
@@ -194,10 +194,10 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         """Indices of all training views."""
         return [*range(len(self.train_dataset))]
 
-    def hold_back(self, indices: Iterable[int]) -> None:
+    def hold_out(self, indices: Iterable[int]) -> None:
         """Hold these training views out, from the next step on, until the next call."""
-        self.holdout_indices = sorted(set(indices))
-        self._served = [index for index in self.train_indices if index not in self.holdout_indices]
+        self.held_out_indices = sorted(set(indices))
+        self._served = [index for index in self.train_indices if index not in self.held_out_indices]
         self._order: tuple[int, list[int]] = (-1, [])  # pass over the views, and its order
 
     def view_of_step(self, step: int) -> int:

@@ -128,9 +128,9 @@ def _in_views_of(like: Opened, path: Path, scene: Scene) -> Opened:
         moved = transform(scene, matrix[:, :3], scale, scale * matrix[:, 3])
         views = like.truths[subset], [like.model.camera_of(camera) for camera in like.cameras[subset]]
         scene = max((scene, moved), key=lambda each: measure(each.to(device), *views).psnr)
-    facts: Any = {"source": path, "variant": path.name, "packed_bytes": path.stat().st_size, "method": "", "steps": 0}
-    facts |= dict.fromkeys(("kept", "seed", "prune_s", "pipeline"))
-    return dataclasses.replace(like, model=model_of(scene).to(device), **facts)
+    model, size = model_of(scene).to(device), path.stat().st_size
+    opened = dataclasses.replace(like, model=model, source=path, variant=path.name, packed_bytes=size)
+    return dataclasses.replace(opened, method="", steps=0, kept=None, seed=None, prune_s=None, pipeline=None)
 
 
 def _open_file(path: Path, scene: Scene, data: Path | None) -> Opened:
@@ -173,9 +173,9 @@ def _open_run(path: Path, data: Path | None, split: Literal["test", "val"]) -> O
     if split == "test":
         pipeline.eval()
     kept, seconds = (1.0, 0.0) if model.config.pruning.mode == "off" else kept_and_seconds(prunes_of(path.parent))
-    names = config.method_name or "", config.experiment_name or ""
-    facts: Any = {"kept": kept, "seed": config.machine.seed, "prune_s": seconds, "pipeline": pipeline}
-    return Opened(model, pipeline.datamanager, path.parent, capture, *names, step + 1, **facts)
+    method, variant = config.method_name or "", config.experiment_name or ""
+    opened = Opened(model, pipeline.datamanager, path.parent, capture, method, variant, step + 1)
+    return dataclasses.replace(opened, kept=kept, seed=config.machine.seed, prune_s=seconds, pipeline=pipeline)
 
 
 def _config_of(path: Path) -> TrainerConfig:

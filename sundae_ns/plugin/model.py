@@ -341,7 +341,7 @@ class SundaeModel(SplatfactoModel):
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None
     ) -> dict[str, Tensor]:
-        """Loss of the image and, while the head is enabled, an L1 loss of the base colours."""
+        """Terms of the loss by name, each ``[]``: see :class:`.StepLosses`; in training also the camera optimizer's."""
         target, mask = self.target(batch, outputs), self.mask(batch, outputs.get("window"))
         losses = self.losses(self.state, self.state.gaussians, outputs["rgb"], outputs["base_rgb"], target, mask)
         if self.training:
@@ -404,11 +404,11 @@ class NerfstudioRun:
 
     def hold_out(self, indices: Iterable[int]) -> None:
         """Hold out these training views from the next step on, until the next call."""
-        self._datamanager.hold_back(indices)
+        self._datamanager.hold_out(indices)
 
-    def heldout_views(self) -> Iterator[Photo]:
+    def held_out_views(self) -> Iterator[Photo]:
         """The held-out training views, loaded one at a time."""
-        for camera, batch in self._datamanager.cameras(self._datamanager.holdout_indices):
+        for camera, batch in self._datamanager.cameras(self._datamanager.held_out_indices):
             yield self._photo(camera, batch)
 
     def photos(self) -> Iterator[Photo]:

@@ -54,16 +54,15 @@ def finetune(
     config: PackConfig,
     steps: int,
     *,
-    rate: float = RATE,
     data: Path | None = None,
     progress: Callable[[Tensor], object] = lambda _: None,
 ) -> tuple[PackedScene, Codecs]:
     """Train the Gaussians and head of a run with the rounding of its pack in the loop. The run is only read.
 
     ``scene`` is the same run, from ``scene.packing.contents_of``; the trained one and its codecs are returned.
-    ``config`` has the bits of the pack, ``rate`` is added to the loss for each bit per stored number. ``progress`` gets
-    the loss ``[]`` of each step, which the next one overwrites. Errors are those of :func:`load_model`, and a
-    ``CheckpointError`` if the run still densifies, a ``ConfigError`` for fewer steps than 1.
+    ``config`` has the bits of the pack. ``progress`` gets the loss ``[]`` of each step, which the next one overwrites.
+    Errors are those of :func:`load_model`, and a ``CheckpointError`` if the run still densifies, a ``ConfigError`` for
+    fewer steps than 1.
     """
     if steps < 1:
         raise ConfigError(f"a fine-tune of {steps} steps changes nothing; give 1 or more")
@@ -79,7 +78,7 @@ def finetune(
         value.requires_grad_(name in codecs.gaussians)
     codecs = codecs.to(model.device)
     pipeline.train()
-    training = RoundedTraining(model, codecs, rate, head=bool(scene.head))
+    training = RoundedTraining(model, codecs, head=bool(scene.head))
     generators = [torch.cuda.current_device()] if model.device.type == "cuda" else []
     with naming_full_memory(lambda: model.num_points), torch.random.fork_rng(generators):
         torch.manual_seed(opened.seed or 0)  # of random backgrounds
@@ -106,13 +105,13 @@ class RoundedTraining:
     The codecs are those of the model's scene, on its device; ``head`` says whether the pack has a head.
     """
 
-    def __init__(self, model: SundaeModel, codecs: Codecs, rate: float, *, head: bool) -> None:
+    def __init__(self, model: SundaeModel, codecs: Codecs, *, head: bool) -> None:
         self._model, self._codecs = model, codecs
         # Weights of the head, parameters of the model, and the values that are trained, by the same names
         self.head = dict(model.head.named_parameters()) if head and model.head is not None else {}
         self.rounded = {name: model.gauss_params[name] for name in codecs.gaussians} | self.head
         self.exact = {name: value.detach().clone().requires_grad_() for name, value in self.rounded.items()}
-        self._rate = rate / sum(value.numel() for value in self.exact.values())
+        self._rate = RATE / sum(value.numel() for value in self.exact.values())
         groups: list[dict[str, Any]] = [
             {"params": [self.exact[name]], "lr": RATES[name], "eps": 1e-15} for name in codecs.gaussians
         ]
@@ -144,11 +143,9 @@ class RoundedTraining:
         model = self._model
         loss, _, result = training_step(model.source, model.state, model.losses, inputs, settings)
         gradients = torch.autograd.grad(loss, list(self.rounded.values()), allow_unused=True)
-        of_rate: tuple[Tensor | None, ...] = (None,) * len(self.exact)
-        if self._rate > 0:
-            with torch.enable_grad():
-                total = self._rate * torch.stack(list(estimated_bits(self._codecs, gaussians, head).values())).sum()
-            of_rate = torch.autograd.grad(total, list(self.exact.values()), allow_unused=True)
+        with torch.enable_grad():
+            total = self._rate * torch.stack(list(estimated_bits(self._codecs, gaussians, head).values())).sum()
+        of_rate = torch.autograd.grad(total, list(self.exact.values()), allow_unused=True)
         for name, gradient, second in zip(self.exact, gradients, of_rate, strict=True):
             self.set_gradient(name, gradient, second)
         # torch's Adam reads this name: it changes nothing where it is 1.

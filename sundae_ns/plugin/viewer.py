@@ -82,7 +82,7 @@ class ViewerControls(torch.nn.Module):
         state: TrainingState,
         configured: PruneRule,
         contribute: Callable[[Any, int | None], Tensor],
-        curve: Callable[[], Sequence[CurvePoint]] = list,
+        curve: Callable[[], Sequence[CurvePoint]],
     ) -> None:
         super().__init__()
         self.compensate = ViewerCheckbox("Neural compensation", True, hint="Off shows the base colours alone")

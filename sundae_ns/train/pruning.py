@@ -234,7 +234,7 @@ class ScheduledPruning(Callback):
     def after_step(self, run: TrainingRun) -> None:
         """Prune if it is due, evaluate, report, and restart the learning rates; saves before a ``SundaeError``."""
         state, config, due = run.state, self.config, self.needs_all(run)
-        # Growing peaks before culling.
+        # Densification has the most Gaussians after growing, before it culls.
         state.pruning["peak"] = max(state.pruning["peak"], state.densification.get("peak", 0))
         if due:
             log.info(f"step {state.step}: pruning {run.source.total:,} Gaussians, with passes over the training views")

@@ -56,9 +56,9 @@ class Decay:
 
     def __call__(self, step: int) -> float:
         """The multiplier at ``step``."""
-        start, begin, end, rise, factor = 1.0, 0, self.max_steps, 1.0, 1.0
         if self.pruned_at is None and self.hold_until_prune:
             return 1.0
+        start, begin, end, rise, factor = 1.0, 0, self.max_steps, 1.0, 1.0
         if self.pruned_at is not None and self.restart is not None and step >= self.pruned_at:
             start, begin, factor = self.restart, self.pruned_at, self.after_prune
             end = self.max_steps if self.ends_at is None else self.ends_at
@@ -164,7 +164,7 @@ SCHEDULE = (
 
 LEAST_IMAGES = 50  # Images between two rounds of densification: fewer say too little of a Gaussian's gradient
 LEAST_RECOVERY = 1000  # Least steps between two resets of the opacities: shorter runs have no time to recover
-LONGEST_RISE = 12  # A learning rate rises over at most this fraction of the run
+LONGEST_RISE = 12  # A learning rate rises over at most the length of the run divided by this
 _SHAPES = ("sh_degree", "head.size", "head.num_features", "head.pixel_unshuffle")  # Shapes in a checkpoint follow them
 RESETS = "pipeline.model.reset_alpha_every"  # Counts rounds of densification, not steps
 
@@ -176,7 +176,7 @@ def set_schedule(config: Any, usual: Any, words: Iterable[str]) -> None:
     it is not known. Options in the command line ``words`` keep their value. ``ConfigError`` if no steps are left, or
     the length is no number of steps.
     """
-    usual = deepcopy(usual)
+    usual = deepcopy(usual)  # config may share parts with it
     given, saved = given_options(words), config.load_dir or config.load_checkpoint
     if saved is not None:
         run = _resumed_run(config, saved)

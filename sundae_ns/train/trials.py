@@ -73,10 +73,10 @@ _DISABLED = "so it stays disabled; train longer, or force it with --pipeline.mod
 
 
 @torch.no_grad()
-def measure_heldout(run: TrainingRun, *, with_fitted: bool = False) -> list[HeldOutQuality]:
+def measure_held_out(run: TrainingRun, *, with_fitted: bool = False) -> list[HeldOutQuality]:
     """Quality of the held-out views, with the head if it is enabled; fully masked views are left out."""
     qualities = []
-    for camera, target, mask in run.heldout_views():
+    for camera, target, mask in run.held_out_views():
         image = render_view(run.source, camera, run.background, run.settings, depth=False)[0]["rgb"]
         quality = view_quality(image, target, mask)
         if quality.pixels:
@@ -367,7 +367,7 @@ class Trials(Callback):
     def measure(self, run: TrainingRun) -> list[HeldOutQuality]:
         """Quality of the held-out views with the mean of the weights, if there is one."""
         with self._mean.applied(weights_of(run.state)):
-            return measure_heldout(run, with_fitted=self.progress.stage == "count")
+            return measure_held_out(run, with_fitted=self.progress.stage == "count")
 
     def _go_on(self, run: TrainingRun) -> None:
         """Once the current trial has ended, measure it; try the next candidate of the stage, or choose."""

@@ -55,7 +55,7 @@ def make_counting(make):
 def judged(monkeypatch, quality):
     """Fix the qualities of held-out views of a run; means of weights are taken in trials of few steps."""
     monkeypatch.setattr(trials, "AVERAGED_EVERY", 1)
-    monkeypatch.setattr(trials, "measure_heldout", lambda run, **_: quality(run))
+    monkeypatch.setattr(trials, "measure_held_out", lambda run, **_: quality(run))
 
 
 def after_each_step(callback, note):
@@ -76,7 +76,7 @@ def centers_of(model):
 @pytest.fixture
 def judge_counts(monkeypatch):
     """Fix what the counts lose against all Gaussians, PSNR in dB by share, and what a head gains at a tenth."""
-    real = trials.measure_heldout
+    real = trials.measure_held_out
 
     def fix(losses, head=0.0):
         def quality(run):
@@ -91,7 +91,7 @@ def judge_counts(monkeypatch):
             else:
                 loss = losses[trials.SHARES[len(progress.of("count"))]]
                 decibels, similarity = 30 - loss, 0.9 - 0.03 * loss
-            return [HeldOutQuality(100, decibels, similarity, decibels) for _ in run.heldout_views()]
+            return [HeldOutQuality(100, decibels, similarity, decibels) for _ in run.held_out_views()]
 
         judged(monkeypatch, quality)
 
@@ -220,7 +220,7 @@ def judge_heads(monkeypatch):
     """Fix what the candidates gain on every held-out view: PSNR in dB, SSIM. Bytes of tiny Gaussians do not count."""
     monkeypatch.setattr(choice, "GAIN_PER_DOUBLING", 0.0)
     monkeypatch.setattr(trials, "MEAN_SHARE", 0.6)
-    real = trials.measure_heldout
+    real = trials.measure_held_out
 
     def fix(head=(0.0, 0.0), features=(0.0, 0.0)):
         def quality(run):
@@ -346,7 +346,7 @@ def test_masks_that_leave_no_pixel_leave_no_head(make, judge_heads, monkeypatch)
     assert record["decision"] == "plain"
     assert record["reason"] == "masks leave no pixel of the held-out training views"
     assert trainer.pipeline.model.head is None
-    assert trainer.pipeline.datamanager.holdout_indices == []
+    assert trainer.pipeline.datamanager.held_out_indices == []
 
 
 def test_several_gpus_train_the_head_without_trials(make, judge_heads):
@@ -367,7 +367,7 @@ def test_several_gpus_train_the_head_without_trials(make, judge_heads):
     assert records_of(resumed)["head"]["reason"] == "trials need a single GPU"
     assert model.state.head_enabled
     assert model.gauss_params["features"].shape[1] == 29
-    assert resumed.pipeline.datamanager.holdout_indices == []
+    assert resumed.pipeline.datamanager.held_out_indices == []
     assert deciding.kept == {}
 
 
@@ -382,7 +382,7 @@ def curve(monkeypatch):
 
     def fix(decibels):
         def quality(run):
-            assert len(list(run.heldout_views())) == 2
+            assert len(list(run.held_out_views())) == 2
             return [HeldOutQuality(576, decibels(run.state.step), 0.5)]
 
         judged(monkeypatch, quality)
@@ -499,7 +499,7 @@ def test_a_run_resumed_at_any_step_is_the_run(make, monkeypatch, views, keep_rat
         gain = {"count": -losses[n % 6], "tenth": 0.3 * n, "head": 0.5 * n, "length": -0.1 * abs(n - 3)}
         # With a trace of the weights, so that other weights have other figures.
         figure = 25 + gain[progress.stage] + 1e-6 * float(run.state.gaussians["means"].detach().abs().mean())
-        return [HeldOutQuality(100, figure, 0.5 + figure / 100, figure) for _ in run.heldout_views()]
+        return [HeldOutQuality(100, figure, 0.5 + figure / 100, figure) for _ in run.held_out_views()]
 
     judged(monkeypatch, quality)
 

@@ -97,7 +97,6 @@ def test_full_disk(tmp_path, name):
     ("error", "kind", "message"),
     [
         (OSError(errno.ENOSPC, "no"), StorageError, "cannot make a: the disk is full; make room$"),
-        (OSError(errno.EROFS, "no"), StorageError, "cannot make a: .*read-only"),
         (OSError(errno.EACCES, "no"), StorageError, "cannot make a: permission denied"),
         (OSError(errno.ENOENT, "no"), StorageError, "cannot make a: .*missing"),
         (OSError(errno.EMFILE, "too many open files"), OSError, r"\[Errno \d+\] too many open files"),

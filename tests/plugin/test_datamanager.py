@@ -49,21 +49,21 @@ def test_next_train_serves_the_view_of_the_step(still_life, load):
 
 def test_held_back_views_are_not_trained_on_and_are_loaded_when_their_turn_comes(still_life, load, monkeypatch):
     made = load(still_life)
-    assert (made.holdout_indices, list(made.cameras([]))) == ([], [])
-    made.hold_back([5, 2])
-    assert made.holdout_indices == [2, 5]
+    assert (made.held_out_indices, list(made.cameras([]))) == ([], [])
+    made.hold_out([5, 2])
+    assert made.held_out_indices == [2, 5]
     assert {made.view_of_step(step) for step in range(50)} == set(range(VIEWS)) - {2, 5}
     cameras, masks = zip(*made.training_views(), strict=True)  # a prune looks at all of them
     assert masks == (None,) * VIEWS
     poses = torch.cat([camera.camera_to_worlds for camera in cameras])
     assert torch.equal(poses, made.train_dataset.cameras.camera_to_worlds)
-    (camera, batch), _ = made.cameras(made.holdout_indices)
+    (camera, batch), _ = made.cameras(made.held_out_indices)
     assert batch["image_idx"] == 2
     assert torch.equal(camera.camera_to_worlds[0], made.train_dataset.cameras.camera_to_worlds[2])
     assert batch["image"].shape == (SIDE, SIDE, 3)
     moved = []
     monkeypatch.setattr(made, "_camera", moved.append)
-    rest = made.cameras(made.holdout_indices)
+    rest = made.cameras(made.held_out_indices)
     assert moved == []
     next(rest)
     assert moved == [2]

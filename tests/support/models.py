@@ -62,7 +62,7 @@ class FakeDatamanager:
 
     eval_dataset = None
     place = (0, 1)
-    holdout_indices = ()
+    held_out_indices = ()
     train_indices = (0, 1, 2)
 
     mask = None

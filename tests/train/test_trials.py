@@ -101,7 +101,7 @@ def test_the_mean_of_the_last_weights_is_measured(run, monkeypatch, averaged, sh
         seen.append(height(run))
         return [VIEW]
 
-    monkeypatch.setattr(trials_module, "measure_heldout", measured)
+    monkeypatch.setattr(trials_module, "measure_held_out", measured)
     monkeypatch.setattr(trials_module, "MEAN_SHARE", averaged)
     trials = trials_for(run.state)
     trials.start(run, "head", 5, [], width=0)
@@ -148,7 +148,7 @@ def test_a_state_in_the_middle_of_a_trial_is_resumed(run, monkeypatch):
     other.hold_out(run)
     assert run.held_out == [1, 3]
     assert run.train(other) == 2
-    monkeypatch.setattr(trials_module, "measure_heldout", lambda run, **_: [VIEW._replace(psnr=height(run))])
+    monkeypatch.setattr(trials_module, "measure_held_out", lambda run, **_: [VIEW._replace(psnr=height(run))])
     assert other.measure(run)[0].psnr == 4.0  # of the steps 2 to 6
     other.go_back("start", state)
     assert (height(run), other.taken_back) == (0.0, 6)

@@ -236,7 +236,8 @@ def test_other_steps_keep_grids_and_bases(tmp_path):
     """Of a scene that has moved since, whose own bases would be others."""
     present = PackConfig(block=100, position_bits=11, head_step=0.1)
     fitted, codecs = fit_scene(full_scene(), present)
-    moved = replace(fitted, gaussians={name: drifted_tensor(value) for name, value in fitted.gaussians.items()})
+    moved = {k: torch.from_numpy(drifted(v.flatten(1).numpy(), 0)).view_as(v) for k, v in fitted.gaussians.items()}
+    moved = replace(fitted, gaussians=moved)
     wanted = replace(present, scale_step=0.2, rotation_step=0.002, head_step=0.8, position_bits=16, block=1024)
     other = codecs.with_steps(wanted, moved.gaussians, moved.head)
     assert other.blocks is codecs.blocks
@@ -266,10 +267,6 @@ def test_steps_that_are_too_fine_for_a_row_become_larger():
     finer = codec.with_step(0.0001, rows)
     assert finer.step > 0.005
     assert np.abs(finer.rounded(torch.from_numpy(rows)).numpy() - rows).max() < 0.1
-
-
-def drifted_tensor(values):
-    return torch.from_numpy(drifted(values.flatten(1).numpy(), 0)).reshape(values.shape)
 
 
 @pytest.mark.gpu
