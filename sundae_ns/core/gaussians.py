@@ -187,8 +187,7 @@ class Sanitised(NamedTuple):
         kinds = {"opacity 0 or 1": self.limits, "width 0": self.flat, "rotation 0": self.unrotated}
         named = " and ".join(f"{number:,} with {name}" for name, number in kinds.items() if number)
         parts = [f"clamped {named} to finite values"] if named else []
-        if self.dropped:
-            parts.append(f"dropped {self.dropped:,} that were not finite (NaN or infinite)")
+        parts += [f"dropped {self.dropped:,} that were not finite (NaN or infinite)"] if self.dropped else []
         return f"{len(self.mask):,} Gaussians: {', '.join(parts)}" if parts else ""
 
 

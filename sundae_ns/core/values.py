@@ -35,7 +35,7 @@ def whole(value: Any, name: str, least: int = 1, most: int = 2**63 - 1) -> int:
     if isinstance(value, (int, float)) and value > most:
         raise ConfigError(f"{name} is {value}; give at most {most:,}")
     if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or float(value) % 1 or value < least:
-        raise ConfigError(f"{name} is {value!r}; give a whole number, at least {least}")
+        raise ConfigError(f"{name} is {value!r:.80}; give a whole number, at least {least}")
     return int(value)
 
 
@@ -90,7 +90,8 @@ def fitting() -> Iterator[None]:
     try:
         with usual_defaults():
             yield
-    except SundaeError:
-        raise
-    except (TypeError, ValueError, AttributeError, LookupError, ArithmeticError, NotImplementedError) as error:
+    except (TypeError, ValueError, AttributeError, LookupError, ArithmeticError, RuntimeError, OSError) as error:
+        unfit = f"{type(error).__name__} {error}".startswith(("NotImpl", "RuntimeError Boolean value of"))  # by torch
+        if isinstance(error, (SundaeError, RuntimeError, OSError)) and not (unfit or getattr(error, "filename", None)):
+            raise
         raise ConfigError(f"an argument does not fit ({one_line(error)}); the docstring says what to give") from error

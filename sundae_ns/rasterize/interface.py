@@ -159,7 +159,7 @@ def select_backend(name: BackendName, device: torch.device | str) -> Backend:
     """
     device = torch.device(device)
     if name not in ("auto", "gsplat", "cpu", "reference"):
-        raise ConfigError(f"unknown rasterizer {name!r}; use auto, gsplat, cpu or reference")
+        raise ConfigError(f"unknown rasterizer {name!r:.80}; use auto, gsplat, cpu or reference")
     for backend, make, problem_on in (("gsplat", GsplatBackend, _gsplat_problem), ("cpu", _cpu_backend, _cpu_problem)):
         if name in ("auto", backend):
             if (problem := problem_on(device)) is None:

@@ -193,6 +193,8 @@ REFUSED = {
     "no quaternion": (lambda: sn.transform(SCENE, [0, 0, 0, 0]), "rotation is no rotation"),
     "scale": (lambda: sn.transform(SCENE, scale=0), "scale is 0"),
     "moved far": (lambda: sn.transform(SCENE, translation=(5e6, 0, 0)), "the moved scene is too far from zero"),
+    "a long name": (lambda: sn.load(300 * "x" + ".ply"), "File name too long"),
+    "flag": (lambda: sn.render(SCENE, CAMERA, head=torch.zeros(3)), "Boolean value of Tensor"),
     "box": (lambda: sn.crop(SCENE, 0, 1), "a corner of the box is not made of 3 finite numbers"),
 }
 
