@@ -294,8 +294,7 @@ def prune_to_bytes(
     The scene is finite; ``write`` makes the content. Every eighth of the ``cameras`` compares the forms. Bars and
     remarks go to stderr. ``ConfigError`` if hardly a Gaussian fits.
     """
-    n, file_of = scene.num_gaussians, cache(write)
-    packs = len({form.power for form in forms}) > 1
+    n, file_of, packs = scene.num_gaussians, cache(write), len({form.power for form in forms}) > 1
 
     def bytes_of(pruned: PrunedScene, form: Form) -> int:
         return len(file_of(pruned, form))
@@ -328,7 +327,11 @@ def prune_to_bytes(
 
     candidates = ((form, cut(count)) for form, count in possible)
     form, pruned = next(candidates) if len(possible) == 1 else _nearest_form(scene, candidates, cameras, packs)
-    fit = cache(partial(fitted, full=scene, cameras=cameras, rule=rule, images=images, console=console))
+
+    @cache
+    def fit(pruned: PrunedScene) -> PrunedScene:  # colours make up for the harmonics that go
+        stated = pruned._replace(scene=form.of(pruned.scene), moved=pruned.moved or form != forms[0])
+        return fitted(stated, scene, cameras, rule, images=images, console=console)
 
     def sized(change: Callable[[PrunedScene], PrunedScene], near: PrunedScene) -> PrunedScene:
         """What has as many Gaussians as fit, changed before it is written; the search begins ``near`` it."""
@@ -336,11 +339,8 @@ def prune_to_bytes(
         at, size = lambda power: change(cut(max(round(n / 2**power), 1))), partial(bytes_of, form=form)
         return largest(at, size, most, halvings, powers, 1.0)
 
-    if packs:
-        return rounded(fit(pruned), form)
     # A fit hardly changes the bytes, so its search begins with a count that fits without.
-    pruned = sized(fit, sized(lambda pruned: pruned, pruned))
-    return pruned, form, file_of(pruned, form)
+    return rounded(fit(pruned) if packs else sized(fit, sized(lambda pruned: pruned, pruned)), form)
 
 
 def _bytes_by_count(scene: Scene, bytes_of: Callable[[PrunedScene], int]) -> tuple[float, float]:

@@ -165,8 +165,9 @@ def test_prune_by_the_cameras_of_files(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(("name", "asked"), [("a.ply", 0.1), ("a.spz", 0.02), ("a.sundae", 0.012), ("a.html", 0.25)])
-def test_a_size_that_was_asked_for_binds(name, asked, tmp_path, capsys):
+def test_a_size_that_was_asked_for_binds(name, asked, tmp_path, capsys, monkeypatch):
     """With a box, a direction and a page in the same command; if all Gaussians fit, none goes, and a line says so."""
+    monkeypatch.setattr("sundae_ns.scene.prune_scene.refit", noted := Mock(side_effect=pruning.refit))
     points = torch.rand(3000, 3, generator=torch.Generator().manual_seed(0))
     sn.save(sn.Scene.from_points(points, points, sh_degree=2), tmp_path / "in.ply")
     words = ["prune", tmp_path / "in.ply", "-o", tmp_path / name, "--num-cameras", "2", "--up", "0", "1", "0"]
@@ -174,7 +175,8 @@ def test_a_size_that_was_asked_for_binds(name, asked, tmp_path, capsys):
     size, (kept,) = (tmp_path / name).stat().st_size, re.findall("([0-9,]+) of 3,000", capsys.readouterr().out)
     assert 0.97 * asked <= size / 1e6 <= asked
     assert 100 < int(kept.replace(",", "")) < 2700
-    assert sn.load(tmp_path / name).gaussians.sh_degree == (0 if name in ("a.ply", "a.spz") else 2)
+    assert sn.load(tmp_path / name).gaussians.sh_degree == (degree := 0 if name in ("a.ply", "a.spz") else 2)
+    assert {call.args[0].sh_degree for call in noted.call_args_list} == {degree}, "a fit makes up for harmonics that go"
     if name != "a.html":  # whose code takes most of the time, and which is searched for as a .sundae is
         assert run(*words, "--max-mb", "9", "--overwrite") == 0
         said, size = capsys.readouterr(), (tmp_path / name).stat().st_size / 1e6
