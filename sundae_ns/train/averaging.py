@@ -15,7 +15,7 @@ from torch import Tensor
 
 from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 AVERAGED_EVERY = 10  # Steps between two weights that count: neighbours differ by little
 
@@ -126,7 +126,7 @@ class Averaging(Callback):
             self._mean.count_in(weights)
         replaced = self._mean.replace(weights) if state.step == last else {}
         if replaced:
-            log.info(f"step {state.step}: the weights are the mean of {self._mean.count} of the last steps")
+            _log.info(f"step {state.step}: the weights are the mean of {self._mean.count} of the last steps")
             self._replaced = replaced if self._alone else {}
             if last >= run.schedule_length - 1:  # after a part, the mean goes on with the rest of the run
                 self._mean = RunningMean()

@@ -24,7 +24,7 @@ from sundae_ns.graph.filters import Smoother
 from sundae_ns.graph.graph import build_graph
 from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 NEIGHBORS = 8  # Neighbours of a camera in the graph
 SMOOTHING = 8.0  # Strength of the filter that computes the smooth part of the gains
@@ -80,7 +80,7 @@ class ExposureCompensation(Callback):
             self._divides = False
             if self._mode == "on":
                 few = "training photos are too few to be compared with those beside them"
-                log.warning(f"exposure-compensation is off: {len(indices)} {few}")
+                _log.warning(f"exposure-compensation is off: {len(indices)} {few}")
             return
         self._state, self._rows = run.state, np.asarray(indices)
         positions = view_points([camera for camera, _ in run.training_views()]).cpu()
@@ -126,7 +126,7 @@ class ExposureCompensation(Callback):
             return
         most = float(self._gains.double().cpu().log().mean(dim=1).abs().max().exp()) - 1
         changed = f"up to {most:.0%} brighter or darker than those beside them; training has taken that out"
-        log.info(f"photos are {changed if most > 0 else 'as bright as those beside them; none was changed'}")
+        _log.info(f"photos are {changed if most > 0 else 'as bright as those beside them; none was changed'}")
 
     def _update(self, sums: NDArray[np.float64]) -> None:
         """Add measurements to the means, and compute the gains from them."""

@@ -28,7 +28,7 @@ from sundae_ns.scene.virtual_cameras import by_device
 from sundae_ns.train.plane_sweep import Sweep
 from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 FEWEST_POINTS = 50  # With fewer sparse points a user hears that photos overlap too little
 SIDES = {"cuda": 640, "cpu": 160}  # Longest side of the swept images, pixels; a CPU takes a second a view
@@ -50,7 +50,7 @@ class Start:
         if self.failure is not None:
             raise self.failure
         for warning in self.warnings:
-            log.warning(warning)
+            _log.warning(warning)
 
 
 def initial_gaussians(
@@ -115,7 +115,7 @@ def _warm_gaussians(options: Any, source: Path, frame: Frame | None) -> dict[str
     rest = params["features_rest"][:, :columns]
     missing = rest.new_zeros(len(rest), columns - rest.shape[1], 3)
     params["features_rest"] = torch.cat([rest, missing], dim=1)
-    log.info(f"warm start: {len(params['means'])} Gaussians from {source}")
+    _log.info(f"warm start: {len(params['means'])} Gaussians from {source}")
     return params
 
 
@@ -161,4 +161,4 @@ class DenseStart(Callback):
         for name, value in params.items():  # without moments
             replace_parameter(state.gaussians.data, state.optimizers, name, value.to(state.device), {})
         without = "--pipeline.model.dense-start-views 0 leaves them out"
-        log.info(f"{len(xyz):,} points by a plane sweep beside {len(sparse):,} sparse ones ({without})")
+        _log.info(f"{len(xyz):,} points by a plane sweep beside {len(sparse):,} sparse ones ({without})")

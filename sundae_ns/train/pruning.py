@@ -29,7 +29,7 @@ from sundae_ns.scene.render import contribution
 from sundae_ns.train.schedules import notify_pruned
 from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 USUAL_SHARE = 0.1  # Share that a prune keeps unless it is told otherwise
 MANY_VIEWS = 32  # With as many, counts are tried, and no length is: captures of 43 training views gain to the end
@@ -237,7 +237,7 @@ class ScheduledPruning(Callback):
         # Densification has the most Gaussians after growing, before it culls.
         state.pruning["peak"] = max(state.pruning["peak"], state.densification.get("peak", 0))
         if due:
-            log.info(f"step {state.step}: pruning {run.source.total:,} Gaussians, with passes over the training views")
+            _log.info(f"step {state.step}: pruning {run.source.total:,} Gaussians, with passes over the training views")
         before = run.evaluate() if due and self.evaluate else {}
 
         def contribute(count: int | None) -> Tensor:
@@ -256,15 +256,15 @@ class ScheduledPruning(Callback):
             notify_pruned(state.schedulers, state.step, run.source.total, last=with_head)
         if report is None:
             return
-        log.info(summary(report))
+        _log.info(summary(report))
         if report["dropped_nonfinite"]:
-            log.warning(f"removed {report['dropped_nonfinite']} Gaussians that were not finite")
+            _log.warning(f"removed {report['dropped_nonfinite']} Gaussians that were not finite")
         if report["after"] < (config.target_gaussians or 0):
-            log.warning(f"the field has only {report['after']:,} Gaussians; a lower densify-grad-thresh grows more")
+            _log.warning(f"the field has only {report['after']:,} Gaussians; a lower densify-grad-thresh grows more")
         after = run.evaluate() if due and self.evaluate else {}
         for label, results in (("warm-up", before), ("pruned", after)):
             if results:
-                log.info("{}: PSNR {psnr:.2f} dB, SSIM {ssim:.4f} on all test views".format(label, **results))
+                _log.info("{}: PSNR {psnr:.2f} dB, SSIM {ssim:.4f} on all test views".format(label, **results))
         run.log_scalars("Prune", {name: report[name] for name in ("before", "after", "seconds", "peak")})
         if run.folder is not None:
             # A run that was killed between a prune and the next save repeats that prune.
@@ -275,7 +275,7 @@ class ScheduledPruning(Callback):
         """Report the peak, and warn if nothing was pruned."""
         state = run.state
         peak, memory = state.pruning["peak"], peak_memory(state.device) / 1e6
-        log.info(f"peak: {peak:,} Gaussians, {memory:,.0f} MB of {state.device.type} memory")
+        _log.info(f"peak: {peak:,} Gaussians, {memory:,.0f} MB of {state.device.type} memory")
         run.log_scalars("Peak", {"gaussians": peak, "memory_mb": memory})
         _warn_if_too_short(run, self.config, state.step)
 
@@ -283,8 +283,8 @@ class ScheduledPruning(Callback):
 def _warn_if_too_short(run: TrainingRun, pruning: PruningConfig, last_step: int) -> None:
     """Warn if a training that ends with this step does not reach its first prune, its last prune, or its head."""
     state, target, starts_at = run.state, pruning.target_gaussians, run.state.head_starts_at
-    begins, ends = ("start", "stop") if pruning.mode == "continuous" else ("prune-at", "prune-at")
-    first, pruned = getattr(pruning, begins.replace("-", "_")), state.pruning["num_prunes"] > 0
+    continuous, pruned = pruning.mode == "continuous", state.pruning["num_prunes"] > 0
+    begins, ends, first = ("start", "stop", pruning.start) if continuous else ("prune-at", "prune-at", pruning.prune_at)
     prunes = pruning.mode != "off" and state.offset == 0  # a warm start is pruned at once
     # A head whose start is not known yet is decided upon elsewhere.
     idle = state.head is not None and math.isfinite(starts_at) and last_step + state.offset <= starts_at
@@ -301,7 +301,7 @@ def _warn_if_too_short(run: TrainingRun, pruning: PruningConfig, last_step: int)
     ]
     for missed, event, step, option, result in rows:
         if missed:
-            log.warning(
+            _log.warning(
                 f"training ends after {last_step + 1:,} steps, and the {event} needs more than {step:,} ({option}): "
                 f"{result}; train longer, or {'enable it' if option.startswith('head') else 'prune'} earlier"
             )
@@ -343,4 +343,4 @@ class FloaterRemoval(Callback):
         pruner = Pruner(state.gaussians, state.optimizers, [state.densification])
         removed = pruner.drop(near_cameras(pruner.params["means"], eyes, self._points), at_most=MOST)
         if removed:
-            log.info(f"step {state.step}: removed {removed:,} floaters right in front of a camera")
+            _log.info(f"step {state.step}: removed {removed:,} floaters right in front of a camera")

@@ -25,7 +25,7 @@ from sundae_ns.io import checkpoint
 from sundae_ns.io.config_file import find_config, load_config
 from sundae_ns.io.pack.config import FINETUNE_STEPS, tuned_steps
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 DecayShape = Literal["exponential", "cosine"]
 
@@ -182,7 +182,7 @@ def set_schedule(config: Any, usual: Any, words: Iterable[str]) -> None:
         run = _resumed_run(config, saved)
         if run is not None and usual is not None:
             for line in take_options(config, run, usual, given):
-                log.warning(line + ("; a prune that is done is not repeated" if ".pruning." in line else ""))
+                _log.warning(line + ("; a prune that is done is not repeated" if ".pruning." in line else ""))
             config.schedule_length = config.schedule_length or run.schedule_length or run.max_num_iterations
             if "max_num_iterations" not in given and config.max_num_iterations == usual.max_num_iterations:
                 step = checkpoint.newest_step(saved) if config.load_step is None else config.load_step
@@ -220,7 +220,7 @@ def _resumed_run(config: Any, saved: Path) -> Any:
     try:
         run = None if path is None else load_config(path)
     except CheckpointError as error:
-        log.warning(f"{error}; the run is resumed with the options of this command")
+        _log.warning(f"{error}; the run is resumed with the options of this command")
     return run if isinstance(run, type(config)) else None
 
 

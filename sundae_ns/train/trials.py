@@ -51,7 +51,7 @@ from sundae_ns.train.pruning import COUNT, MANY_VIEWS, USUAL_SHARE, VIEWS, prune
 from sundae_ns.train.schedules import limit_rise, notify_pruned, put_restarts, restarts
 from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 SHARES: tuple[float, ...] = (1.0, 0.4, 0.2, 0.1, 0.05, 0.025)  # Of the Gaussians that are tried
 COUNT_SHARE = 0.02  # Length of a trial of a count, and of a window of a length, as a share of the schedule
@@ -263,7 +263,7 @@ class Trials(Callback):
                 self._finish_with(run, "plain", f"{num_views} training views are too few to tell whether a head helps")
             elif progress.stage != "head" and "head" not in self.coming and not self._heads_fit(run):
                 if run.last_step is not None:
-                    log.warning("training ends before the head can be tried, %s", _DISABLED)
+                    _log.warning("training ends before the head can be tried, %s", _DISABLED)
         elif several and progress.stage in ("length", "repeat", "paused"):  # a length counts steps of one image
             self._end_length(run, "", None)
         self.hold_out(run)
@@ -299,7 +299,7 @@ class Trials(Callback):
         """Warn if training ended before a decision."""
         undecided = self.decides_head and "head" not in self.progress.chosen
         if undecided and run.last_step is not None and run.last_step + 1 >= (run.schedule_length or 0):
-            log.warning("training ended before the head could be tried, %s", _DISABLED)
+            _log.warning("training ended before the head could be tried, %s", _DISABLED)
 
     def start(self, run: TrainingRun, stage: str, length: int, views: list[int], width: int | None = None) -> None:
         """Start a trial from the present Gaussians, which may be dropped if a width of the features is given."""
@@ -378,7 +378,7 @@ class Trials(Callback):
             self._mean.replace(weights_of(state))  # the mean of the last window stays to the end of the schedule
             state.restored += 1  # another mean must not contain the weights before it
             self._end_length(run, "paused", progress.chosen["length"])
-            log.info(f"step {state.step}: more training would harm other views; the remaining steps change nothing")
+            _log.info(f"step {state.step}: more training would harm other views; the remaining steps change nothing")
             return
         assert self.trial is not None
         enabled, wide = state.head if state.head_enabled else None, len(self._heads) == 3
@@ -402,7 +402,7 @@ class Trials(Callback):
 
     def _announce(self, run: TrainingRun, question: str, trials: int, length: int, views: list[int]) -> None:
         held_out = f"{len(views)} of {len(run.view_indices())} training views are held out"
-        log.info(f"step {run.state.step}: {question} Up to {trials} trials of {length:,} steps; {held_out}")
+        _log.info(f"step {run.state.step}: {question} Up to {trials} trials of {length:,} steps; {held_out}")
 
     def curve(self) -> list[CurvePoint]:
         """Expected quality over the counts that were tried, largest first, with a head if trials say that it pays."""
@@ -470,11 +470,11 @@ class Trials(Callback):
             return
         count, reason = self._count_of(curve)
         self._set_count(run, count)
-        log.info("\n".join(["expected at the end, on held-out training views:", *curve_table(curve)]))
-        log.info(f"keeping {count:,} of {progress.full:,} Gaussians: {reason}")
+        _log.info("\n".join(["expected at the end, on held-out training views:", *curve_table(curve)]))
+        _log.info(f"keeping {count:,} of {progress.full:,} Gaussians: {reason}")
         if choice.still_climbs(curve, self._tolerance):
             more = "a lower --pipeline.model.densify-grad-thresh makes more Gaussians, which the scene may need"
-            log.info(f"quality still grows at the full count: {more}")
+            _log.info(f"quality still grows at the full count: {more}")
         run.log_scalars("Curve", {"chosen": count, "full": progress.full})
         record: dict[str, Any] = {"chosen": count, "full": progress.full, "reason": reason, "step": run.state.step}
         record |= {"tolerance": self._tolerance._asdict(), "held_out_views": self._judges}
@@ -483,13 +483,13 @@ class Trials(Callback):
         record |= {"steps_per_trial": self._window, "curve": points}
         if "tenth" in progress.chosen:
             figures = _figures(progress.of("tenth"))
-            log.info(f"a tenth of the Gaussians after {self._length:,} steps: {_in_words(figures)}")
+            _log.info(f"a tenth of the Gaussians after {self._length:,} steps: {_in_words(figures)}")
             record["head"] = {"pays": progress.chosen["tenth"], "steps_per_trial": self._length, **figures}
         self._record(run, count=record)
 
     def _keep_usual(self, run: TrainingRun, reason: str) -> None:
         kept = f"pruning keeps {usual_share(run.state.pruning[VIEWS]):.0%} of the Gaussians"
-        log.warning(f"{kept}: {reason}; --pipeline.model.pruning.keep-ratio sets it")
+        _log.warning(f"{kept}: {reason}; --pipeline.model.pruning.keep-ratio sets it")
         self._set_count(run, 0)
 
     def _set_count(self, run: TrainingRun, count: int) -> None:
@@ -537,7 +537,7 @@ class Trials(Callback):
         reason = "" if all(row.views for row in tried) else _MASKED
         record: dict[str, Any] = {}
         if not reason:
-            log.info(f"step {run.state.step}: held-out training views: {_in_words(figures)}. Continuing: {NAMES[head]}")
+            _log.info(f"step {run.state.step}: held-out training views: {_in_words(figures)}. Chosen: {NAMES[head]}")
             run.log_scalars("Trials", {f"psnr_{name}": figure["psnr"] for name, figure in figures.items()})
             record = {"held_out_views": sum(self._folds, []), "steps_per_trial": self._length, "arms": figures}
         if head != trained:
@@ -548,7 +548,7 @@ class Trials(Callback):
         """Take a decision about the head, serve all training views from now on, and record it."""
         progress, state = self.progress, run.state
         if reason:
-            log.info(f"the head is {'removed' if head == 'plain' else 'enabled'}: {reason}")
+            _log.info(f"the head is {'removed' if head == 'plain' else 'enabled'}: {reason}")
         progress.stage, progress.chosen["head"], progress.reason = "", head, reason
         self.end(run, "head")
         self.enable_head(state, head != "plain")
@@ -569,7 +569,7 @@ class Trials(Callback):
         self.keep("start", state, head=state.head_enabled)
         self.start(run, "length", self._window, views)
         held = f"{num_views} training views are few; {len(views)} stay held out"
-        log.info(f"step {state.step}: {held}, to see when training stops helping")
+        _log.info(f"step {state.step}: {held}, to see when training stops helping")
 
     def _try_length(self, run: TrainingRun) -> None:
         """Train another window; or go back, to train on all views for as many steps as were best."""
@@ -584,12 +584,12 @@ class Trials(Callback):
         if length is not None:
             then, now = (f"{row['psnr']:.2f} dB, SSIM {row['ssim']:.4f}" for row in (measured[best - 1], measured[-1]))
             best_at = f"the held-out views were best after {length:,} steps, {then}; now {now}"
-            log.info(f"step {state.step}: {best_at}. Going back, to train as long on all views")
+            _log.info(f"step {state.step}: {best_at}. Going back, to train as long on all views")
             self.go_back("start", state)
             self._end_length(run, "repeat", length)
             self.start(run, "repeat", length, [])
         elif state.schedule_step + self._window > progress.watched_until:
-            log.info(f"step {state.step}: the held-out views lose nothing; training goes on, on all views")
+            _log.info(f"step {state.step}: the held-out views lose nothing; training goes on, on all views")
             self._end_length(run, "", None)
         else:
             self.start(run, "length", self._window, views)
