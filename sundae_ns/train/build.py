@@ -51,18 +51,19 @@ def build(
     """
     check(options)
     pruning, head, warm = options.pruning, options.head.resolved, options.warm_start is not None
-    strategy, num_features = make_strategy(options, num_images), 0 if head.mode == "off" else head.num_features
-    params, start = initial_gaussians(options, points, frame, num_features=num_features, cap=strategy.cap)
+    strategy = make_strategy(options, num_images)
+    params, start = initial_gaussians(options, points, frame)
     gauss_params = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in params.items()})
     state = TrainingState(
         gaussians=Gaussians(cast(Any, gauss_params), "logits" if options.sh_degree == 0 else "harmonics"),
         networks=torch.nn.ModuleDict({} if head.mode == "off" else {"head": CompensationHead(head)}),
+        pruning=dict(UNPRUNED),
         offset=pruning.prune_at if warm else 0,
         densify_until=strategy.refine_stop_iter,
         head_starts_at=pruning.settled_at if head.start_at is None else head.start_at,
         sh_degree_interval=None if warm else options.sh_degree_interval,
     )
-    state.pruning, densification = dict(UNPRUNED), Densification(strategy)
+    densification = Densification(strategy)
     densification.initialize(state)
     prunes: list[Callback] = [ScheduledPruning(pruning, evaluate=options.evaluate_prune)]
     if pruning.decides or options.head.mode == "auto":
@@ -70,7 +71,7 @@ def build(
         trials = Trials(options, state, densification, begins_at)
         prunes = [trials, *prunes, AfterPrune(trials)]
     train_callbacks = [
-        DenseStart(options, points, num_images, num_features=num_features, cap=strategy.cap),
+        DenseStart(options, points, num_images),
         densification,
         FloaterRemoval(None if points is None else points[0]),
         *prunes,

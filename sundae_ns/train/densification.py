@@ -123,7 +123,7 @@ def make_strategy(options: Any, num_images: int) -> CappedStrategy:
     pruning = options.pruning
     ends = (options.stop_split_at, pruning.ends_growth_at)
     strategy = CappedStrategy(
-        cap=pruning.max_gaussians if pruning.mode == "continuous" else None,
+        cap=pruning.cap,
         prune_opa=options.cull_alpha_thresh,
         grow_grad2d=options.densify_grad_thresh,
         grow_scale3d=options.densify_size_thresh,

@@ -53,33 +53,30 @@ class Start:
             _log.warning(warning)
 
 
-def initial_gaussians(
-    options: Any, points: Points | None, frame: Frame | None, *, num_features: int, cap: int | None
-) -> tuple[dict[str, Tensor], Start]:
+def initial_gaussians(options: Any, points: Points | None, frame: Frame | None) -> tuple[dict[str, Tensor], Start]:
     """Parameters of a new model, float32 on the CPU, and what to report if it is trained; arguments as for ``build``.
 
     A finished run must open without the file that it started from. The field then comes from the sparse points, and the
-    error is reported only when training starts. ``num_features`` is the length of the feature vectors, 0 for none;
-    ``cap`` the highest number of Gaussians to start with.
+    error is reported only when training starts.
     """
-    start = Start()
     try:
         if options.warm_start is None:
-            params, start = _sparse_gaussians(options, points, cap)
+            params, start = _sparse_gaussians(options, points)
         else:
-            params = _warm_gaussians(options, options.warm_start, frame)
+            params, start = _warm_gaussians(options, options.warm_start, frame), Start()
     except CheckpointError as error:
-        params, start = _sparse_gaussians(options, points, cap)[0], Start(failure=error)
-    if num_features:
-        params[FEATURES] = initial_features(params["features_dc"], num_features)
+        params, start = _sparse_gaussians(options, points)[0], Start(failure=error)
+    if options.num_features:
+        params[FEATURES] = initial_features(params["features_dc"], options.num_features)
     if options.sh_degree == 0:
         # splatfacto and nerfstudio's exporter store logits of colours at SH degree 0.
         params["features_dc"] = rgb_to_logit(sh_to_rgb(params["features_dc"]))
     return params, start
 
 
-def _sparse_gaussians(options: Any, points: Points | None, cap: int | None) -> tuple[dict[str, Tensor], Start]:
+def _sparse_gaussians(options: Any, points: Points | None) -> tuple[dict[str, Tensor], Start]:
     warnings: list[str] = []
+    cap = options.pruning.cap
     if points is not None and len(points[0]) > 0 and not options.random_init:
         xyz, rgb = points[0], points[1].float() / 255 if len(points[1]) else torch.full_like(points[0], 0.5)
         if len(xyz) < FEWEST_POINTS:
@@ -124,10 +121,8 @@ class DenseStart(Callback):
 
     name = "dense-start"
 
-    def __init__(
-        self, options: Any, points: Points | None, num_images: int, *, num_features: int, cap: int | None
-    ) -> None:
-        self._options, self._points, self._num_features, self._cap = options, points, num_features, cap
+    def __init__(self, options: Any, points: Points | None, num_images: int) -> None:
+        self._options, self._points = options, points
         wanted = 2 <= num_images <= options.dense_start_views and options.warm_start is None and not options.random_init
         self._done = not wanted or points is None or len(points[0]) == 0
 
@@ -157,7 +152,7 @@ class DenseStart(Callback):
                 xyz, rgb = xyz[even.to(xyz.device)], rgb[even.to(rgb.device)]
         colours = colours.float() if len(colours) else torch.full_like(sparse, 127.5)
         points = torch.cat([sparse, xyz.to(sparse)]), torch.cat([colours, 255 * rgb.to(colours)])
-        params, _ = initial_gaussians(self._options, points, None, num_features=self._num_features, cap=self._cap)
+        params, _ = initial_gaussians(self._options, points, None)
         for name, value in params.items():  # without moments
             replace_parameter(state.gaussians.data, state.optimizers, name, value.to(state.device), {})
         without = "--pipeline.model.dense-start-views 0 leaves them out"

@@ -81,6 +81,11 @@ class PruningConfig(PruneRule):
         return self.mode == "one-shot" and self.keep_ratio is None and self.target_gaussians is None
 
     @property
+    def cap(self) -> int | None:
+        """Most Gaussians of a field that grows; None for no cap."""
+        return self.max_gaussians if self.mode == "continuous" else None
+
+    @property
     def ends_growth_at(self) -> int | None:
         """Last step at which densification may act; None if the mode sets none."""
         return {"one-shot": self.prune_at, "continuous": self.stop}.get(self.mode)

@@ -173,8 +173,7 @@ class StepInputs:
     count: Tensor | None = None  # Number of Gaussians [], where parameters have rows for more
 
     def _tensors(self) -> list[Tensor]:
-        always = (self.camera.viewmat, self.camera.K, self.target, self.background)
-        tensors = (*always, self.mask, self.rates, self.count)
+        tensors = (self.camera.viewmat, self.camera.K, self.target, self.background, self.mask, self.rates, self.count)
         return [value.detach() for value in tensors if value is not None]
 
     def clone(self) -> StepInputs:
