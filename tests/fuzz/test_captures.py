@@ -227,7 +227,6 @@ MODELS = {
     "a name twice": (lambda model: _text(model, f"{ROW} a.png\n\n2{ROW[1:]} a.png"), "image 2: .*'a.png' is .* twice"),
     "another text": (lambda model: write_text_model(model, ["a.png"]), "a text and a binary model that differ; remove"),
     "a folder in the place of a file": (_folder("cameras.bin"), "cannot be read"),
-    "a folder in the place of a text": (_folder("cameras.txt"), "cannot be read"),
     "invalid UTF-8": (lambda model: (model / "cameras.txt").write_bytes(b"1 PIN\xff\xfe"), "cameras.txt .*utf-8"),
     "a pose of 6 numbers": (lambda model: _text(model, "1 1 0 0 0 0 0 1 a.png"), "images.txt .*6 numbers as its pose"),
     "a missing image": (lambda model: next((model.parents[1] / "images").iterdir()).unlink(), "does not exist"),

@@ -270,7 +270,6 @@ HOSTILE = {
     "a codebook of pairs": (_meta(scales={"codebook": [[0.0, 1.0]] * 256, "files": SCALES}), "scales has shape"),
     "NaN for a bound": (_meta(means={"mins": [math.nan] * 3, "maxs": [1] * 3, "files": MEANS}), "none is finite"),
     "the first version": (_meta(version=GONE), "has version 1 of the format; convert it with"),
-    "another version": (_meta(version=3), "has version 3 of the format"),
     "another SH degree": (_meta(**{"shN/bands": 1}), "cannot reshape"),
     "no SH degree": (_meta(shN={"bands": 9, "codebook": [0], "files": []}), "99 SH coefficients"),
 }

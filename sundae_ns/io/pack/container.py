@@ -230,7 +230,7 @@ def read_header(path: Path) -> Header:
         size = path.stat().st_size
         preamble = file.read(_PREAMBLE.size)
         if preamble[: len(MAGIC)] != MAGIC:
-            raise PackError(f"{path} is not a packed scene; give a file that sundae pack wrote")
+            raise ValueError("it does not begin as what sundae pack writes")
         if len(preamble) < _PREAMBLE.size:
             raise ValueError("it ends before its header")
         _, version, length, digest = _PREAMBLE.unpack(preamble)
