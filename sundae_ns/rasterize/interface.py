@@ -63,11 +63,13 @@ def rasterize_cameras(inputs: Inputs, viewmats: Tensor, Ks: Tensor, *, backend: 
 
 
 def each_view(function: Callable[[Any], T], views: Iterable[Any], *, two_at_once: bool) -> Iterator[T]:
-    """Results of a function for each view; ``two_at_once`` on a CPU, where parts of a view take one core."""
-    # A forked process makes torch's own pool anew in the first call that needs it; two at once would fail.
-    torch.set_num_threads(torch.get_num_threads())
-    with ThreadPoolExecutor(2) as pool:
-        yield from (pool.map if two_at_once else map)(function, views)
+    """Results of a function for each view; ``two_at_once`` on a CPU, where each takes half of the threads."""
+    torch.set_num_threads(threads := torch.get_num_threads())  # two at once cannot make the pool of a forked process
+    try:
+        with ThreadPoolExecutor(2, initializer=torch.set_num_threads, initargs=(max(1, threads // 2),)) as pool:
+            yield from (pool.map if two_at_once else map)(function, views)
+    finally:
+        torch.set_num_threads(threads)
 
 
 def spherical_harmonics(degree: int, directions: Tensor, first: Tensor, rest: Tensor, *, backend: Backend) -> Tensor:

@@ -149,26 +149,25 @@ def render_view(
     return images, splatted
 
 
-def may_be_seen(means: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> Tensor:
+def may_be_seen(means: Tensor, largest: Tensor, viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> Tensor:
     """Conservative visibility: True for all Gaussians that a backend renders, and some others; bool ``[R, N]``.
 
     With the largest scale s, the depth z and the slope k of a pixel, clamped to the image and a margin, the Jacobian of
     the perspective map has rows of length ``f / z * sqrt(1 + k^2)``. So a radius is at most ``3 s C / z`` with one C
-    per camera, plus the blur. Takes centres and logarithms of standard deviations ``[N, 3]``, world-to-camera
+    per camera, plus the blur. Takes centres ``[N, 3]`` and largest standard deviations ``[N]``, world-to-camera
     transforms ``[R, 4, 4]``, and intrinsics ``[R, 3, 3]`` and sizes ``[R, 2]`` in pixels.
     """
     off_axis = Ks[:, :2, 2] - sizes / 2
     limit = off_axis.abs() + (0.5 + 0.5 * FOV_MARGIN) * sizes
     # Slightly more than 3, for rounding.
-    reach = 3.003 * (Ks[:, :2, :2].square().sum(dim=(1, 2)) + limit.square().sum(dim=1)).sqrt()
+    reach = 3.003 * (Ks[:, :2, :2].square().sum(dim=(1, 2)) + limit.square().sum(dim=1)).sqrt()[:, None]
     # From the middle of the image: half the size, the blur, the rounding up of the radius, and a pixel for errors.
     sides = torch.cat([Ks[:, :2], -Ks[:, :2]], dim=1)
     sides[:, :, 2] = torch.cat([off_axis, -off_axis], dim=1) - (sizes / 2 + 3 * (2 * BLUR) ** 0.5 + 2).repeat(1, 2)
     planes = sides @ viewmats[:, :3]  # [R, 4, 4]: how far beyond each side, times z
-    beyond = (planes[..., :3].flatten(0, 1) @ means.T + planes[..., 3].reshape(-1, 1)).unflatten(0, (-1, 4))
-    over = beyond - (torch.stack(scales.unbind(dim=1)).amax(dim=0).exp() * reach[:, None])[:, None]
+    beyond = torch.addmm(planes[..., 3].reshape(-1, 1), planes[..., :3].flatten(0, 1), means.T).unflatten(0, (-1, 4))
     # NaN compares as visible in the sides, where backends disagree, but not in depth, where none renders it.
-    return (viewmats[:, 2, :3] @ means.T + viewmats[:, 2, 3:] >= NEAR_PLANE) & ~(over.amax(dim=1) > 0)
+    return (viewmats[:, 2, :3] @ means.T + viewmats[:, 2, 3:] >= NEAR_PLANE) & ~(beyond.amax(dim=1) > largest * reach)
 
 
 @torch.no_grad()
@@ -192,6 +191,7 @@ def contribution(
     from rich.progress import track  # takes 20 ms, which a render without a prune need not spend
 
     total, label = source.gaussians["means"].new_zeros(source.gaussians.num_gaussians), "Contribution of Gaussians"
+    largest = source.gaussians["scales"].amax(dim=1).exp()
 
     @torch.no_grad()
     def of_view(view: tuple[Camera, Tensor | None]) -> tuple[Any, Tensor, Any]:  # rows, their weights, and the image
@@ -202,7 +202,7 @@ def contribution(
         rows: Any = ...
         if total.is_cpu:  # a GPU culls faster than it picks rows
             pose = camera.viewmat[None], camera.K[None], torch.tensor([[camera.width, camera.height]])
-            rows = may_be_seen(source.gaussians["means"], source.gaussians["scales"], *pose)[0].nonzero().squeeze(1)
+            rows = may_be_seen(source.gaussians["means"], largest, *pose)[0].nonzero().squeeze(1)
         visible = GaussianSource(source.gaussians.rows(rows)) if total.is_cpu else source
         pixels = None if mask is None else mask[..., 0].to(total)
         if count is None:

@@ -110,8 +110,7 @@ def _visible_by_depth(keys: Any, radii: Any, opacities: Any) -> Any:
         if radii[i] > 0 and opacities[i] >= smallest:
             ids[count] = i
             count += 1
-    ids = ids[:count].copy()
-    other = np.empty_like(ids)
+    ids, other = ids[:count].copy(), np.empty(count, np.int32)
     ends: Any = np.empty(1 << _DIGIT_BITS, np.int64)
     for shift in range(0, 8 * keys.itemsize, _DIGIT_BITS):
         ends[:] = 0
@@ -150,9 +149,8 @@ def _measure(begin: int, end: int, ids: Any, splats: Any, region: Any, table: An
             boxes[rank, 2 + axis] = np.int32(min(max(high, region[axis]), region[2 + axis]))
             table[rank, HALF_WIDTH + axis] = half
         table[rank, U], table[rank, V] = means2d[i, 0], means2d[i, 1]
-        table[rank, HALF_XX] = number(0.5) * conics[i, 0]
+        table[rank, HALF_XX], table[rank, HALF_YY] = number(0.5) * conics[i, 0], number(0.5) * conics[i, 2]
         table[rank, XY] = conics[i, 1]
-        table[rank, HALF_YY] = number(0.5) * conics[i, 2]
         table[rank, OPACITY], table[rank, LIMIT] = opacities[i], reach
         if not finite:
             boxes[rank] = 0
