@@ -255,15 +255,11 @@ def a_pack(path, place):
     resection(path, place, container.read_sections(path, container.read_header(path))["means/low"])
 
 
-def a_ply(path, place):
-    write_ply(path, small_field(20), comments=[place, f"TextureFile {place}"])
-
-
 CASES = {
     "a.ckpt": (a_checkpoint, checkpoint.read),
     "b.ckpt": (a_checkpoint, read_gaussians),
     "a.sundae": (a_pack, read_scene),
-    "a.ply": (a_ply, read_ply),
+    "a.ply": (lambda path, at: write_ply(path, small_field(20), comments=[at, f"TextureFile {at}"]), read_ply),
 }
 
 
