@@ -121,7 +121,6 @@ class Densification(Callback):
 def make_strategy(options: Any, num_images: int) -> CappedStrategy:
     """Strategy of the densification, which ends before the prune that would undo it, by the options of the model."""
     pruning = options.pruning
-    ends = (options.stop_split_at, pruning.ends_growth_at)
     strategy = CappedStrategy(
         cap=pruning.cap,
         prune_opa=options.cull_alpha_thresh,
@@ -132,7 +131,7 @@ def make_strategy(options: Any, num_images: int) -> CappedStrategy:
         prune_scale2d=options.cull_screen_size,
         refine_scale2d_stop_iter=options.stop_screen_size_at,
         refine_start_iter=options.warmup_length,
-        refine_stop_iter=min(step for step in ends if step is not None),
+        refine_stop_iter=pruning.growth_ends_at(options.stop_split_at),
         reset_every=options.reset_alpha_every * options.refine_every,
         refine_every=options.refine_every,
         absgrad=options.use_absgrad,

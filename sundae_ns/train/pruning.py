@@ -85,10 +85,9 @@ class PruningConfig(PruneRule):
         """Most Gaussians of a field that grows; None for no cap."""
         return self.max_gaussians if self.mode == "continuous" else None
 
-    @property
-    def ends_growth_at(self) -> int | None:
-        """Last step at which densification may act; None if the mode sets none."""
-        return {"one-shot": self.prune_at, "continuous": self.stop}.get(self.mode)
+    def growth_ends_at(self, stop_split_at: int) -> int:
+        """Step at which densification ends: ``stop_split_at``, or an earlier prune, which undoes later growth."""
+        return min(stop_split_at, {"one-shot": self.prune_at, "continuous": self.stop}.get(self.mode, stop_split_at))
 
     @property
     def last_due(self) -> int:

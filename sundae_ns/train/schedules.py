@@ -300,8 +300,7 @@ def schedule_table(config: Any) -> list[tuple[str, str]]:
         f"1/{2 ** (model.num_downscales - i)} until {(i + 1) * model.resolution_schedule:,}, "
         for i in range(0 if warm else model.num_downscales)
     ]
-    ends, resets = (model.stop_split_at, pruning.ends_growth_at), model.reset_alpha_every * model.refine_every
-    last = min(step for step in ends if step is not None)
+    last, resets = pruning.growth_ends_at(model.stop_split_at), model.reset_alpha_every * model.refine_every
     reset = f"reset every {resets:,}" if resets < last else "never reset"
     growth = f"{model.warmup_length:,} to {last:,}, every {model.refine_every:,}; opacities {reset}"
     prune = {
