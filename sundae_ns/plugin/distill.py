@@ -33,7 +33,7 @@ from sundae_ns.train.averaging import AVERAGED_EVERY, RunningMean, weights_of
 from sundae_ns.train.choice import least_gain
 from sundae_ns.train.graphed_step import RecordedStep
 from sundae_ns.train.schedules import NETWORK_BETAS, fused_adam, network_groups, sparse_factor
-from sundae_ns.train.state import TrainingState
+from sundae_ns.train.state import HEAD, TrainingState
 from sundae_ns.train.step import StepInputs, StepLosses, training_step
 
 STEPS = {"cpu": 3000, "cuda": 8000}  # Steps by the device
@@ -108,7 +108,7 @@ class Distillation:
         }
         if head is not None:
             groups = network_groups(networks["head"].parameters(), 1e-3, weight_decay=0.15)
-            optimizers["compensation"] = fused_adam(groups, eps=1e-8, betas=NETWORK_BETAS, decoupled_weight_decay=True)
+            optimizers[HEAD] = fused_adam(groups, eps=1e-8, betas=NETWORK_BETAS, decoupled_weight_decay=True)
         focals = [camera.focal for camera in self.cameras]
         return TrainingState(
             Gaussians(cast(Any, trained), gaussians.encoding),
@@ -149,7 +149,7 @@ class Distillation:
         def factor(name: str, i: int) -> float:
             if name == "means":
                 return sparse * 0.01 ** (i / steps)
-            return rate_factor(i, steps) if name == "compensation" else 1.0
+            return rate_factor(i, steps) if name == HEAD else 1.0
 
         for i in optimise(self.state.optimizers, steps, factor, first):
             self._train_step(i)

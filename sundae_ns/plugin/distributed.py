@@ -38,8 +38,7 @@ from sundae_ns.core.gaussians import FEATURES, Gaussians
 from sundae_ns.core.surgery import change_parameter, per_gaussian
 from sundae_ns.scene.render import GaussianSource, RenderSettings, colors_from, may_be_seen
 from sundae_ns.train.densification import COUNTED, start_counting
-from sundae_ns.train.graphed_step import HEAD
-from sundae_ns.train.state import Callback, TrainingState
+from sundae_ns.train.state import HEAD, Callback, TrainingState
 
 
 def check_options(config: Any) -> None:

@@ -44,7 +44,7 @@ from sundae_ns.train.curve import CurvePoint
 from sundae_ns.train.exposure import ExposureCompensation
 from sundae_ns.train.initialize import Start
 from sundae_ns.train.pruning import DROPPED, FEW_DROPPED, MANY_VIEWS, PruningConfig
-from sundae_ns.train.state import Callback, Photo, TrainingState
+from sundae_ns.train.state import HEAD, Callback, Photo, TrainingState
 from sundae_ns.train.step import StepInputs, StepLosses, StepResolution, training_part
 from sundae_ns.train.trials import Trials
 
@@ -150,7 +150,7 @@ class SundaeModel(SplatfactoModel):
         """Groups of the Gaussians, of the head (``compensation``) and of the cameras."""
         groups = super().get_param_groups()
         if self.head is not None:
-            groups["compensation"] = list(self.head.parameters())
+            groups[HEAD] = list(self.head.parameters())
         return groups
 
     # -------------------------------------------------------------------------------------------------- checkpoints

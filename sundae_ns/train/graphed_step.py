@@ -25,13 +25,12 @@ from sundae_ns.rasterize.gsplat_backend import RecordableGsplat
 from sundae_ns.rasterize.gsplat_kernels import Capacity
 from sundae_ns.scene.render import GaussianSource, RenderSettings
 from sundae_ns.train.densification import COUNTED, STATISTICS, count_view, start_counting
-from sundae_ns.train.state import TrainingState
+from sundae_ns.train.state import HEAD, TrainingState
 from sundae_ns.train.step import StepInputs, StepLosses, StepResult, training_step
 
 _log = logging.getLogger(__name__)
 
 SPARE = 1.1  # Capacity for a field that grows, as a multiple of its number of Gaussians
-HEAD = "compensation"  # Name of the head's optimizer
 MOMENTS = ("exp_avg", "exp_avg_sq")  # Adam's moments in the state of its optimizer
 _UNSEEN = {"means": 1e15, "scales": -30.0, "opacities": -30.0}
 """Values of the rows beyond: behind the far plane, without width, transparent. Others are zero."""

@@ -23,6 +23,8 @@ from sundae_ns.head.head import CompensationHead
 from sundae_ns.rasterize.types import Backend
 from sundae_ns.scene.render import RenderSettings
 
+HEAD = "compensation"  # Name of the head's optimizer, and of its group of parameters
+
 
 @dataclass
 class TrainingState:
@@ -34,7 +36,7 @@ class TrainingState:
     gaussians: Gaussians  # The Gaussians of this process
     networks: torch.nn.ModuleDict  # Holds the head, if there is one; registered by the model, so in checkpoints
     optimizers: Mapping[str, Optimizer] = dataclasses.field(default_factory=dict)
-    """By parameter name; ``compensation`` is the head's."""
+    """By parameter name; the head's is :data:`HEAD`."""
     schedulers: Mapping[str, LRScheduler] = dataclasses.field(default_factory=dict)
     """By the same names, where rates change."""
     densification: dict[str, Any] = dataclasses.field(default_factory=dict)
@@ -91,7 +93,7 @@ class TrainingState:
         if FEATURES in self.gaussians:
             features = self.gaussians[FEATURES]
             features.data, features.grad = features.data[:, :0], None
-        for name in {"compensation", FEATURES} & self.optimizers.keys():
+        for name in {HEAD, FEATURES} & self.optimizers.keys():
             self.optimizers[name].state.clear()
 
     def widen_head(self, num_features: int) -> bool:
@@ -123,7 +125,7 @@ class TrainingState:
         saved = {"field": snapshot(self.gaussians, self.optimizers)}
         if head:
             assert self.head is not None
-            saved["head"] = module_snapshot(self.head.parameters(), self.optimizers["compensation"])
+            saved["head"] = module_snapshot(self.head.parameters(), self.optimizers[HEAD])
         return saved
 
     def restore(self, saved: Mapping[str, Snapshot]) -> None:
@@ -133,7 +135,7 @@ class TrainingState:
         if "head" in saved:
             assert self.head is not None
             self.widen_head(self.gaussians[FEATURES].shape[1])
-            restore_module(self.head.parameters(), self.optimizers["compensation"], saved["head"])
+            restore_module(self.head.parameters(), self.optimizers[HEAD], saved["head"])
 
     def running_states(self) -> dict[str, dict[str, Any]]:
         """Running states for a checkpoint."""

@@ -49,7 +49,7 @@ from sundae_ns.train.curve import RECORD, CurvePoint, curve_table
 from sundae_ns.train.densification import Densification
 from sundae_ns.train.pruning import COUNT, MANY_VIEWS, USUAL_SHARE, VIEWS, prune_to, usual_share, write_record
 from sundae_ns.train.schedules import limit_rise, notify_pruned, put_restarts, restarts
-from sundae_ns.train.state import Callback, TrainingRun, TrainingState
+from sundae_ns.train.state import HEAD, Callback, TrainingRun, TrainingState
 
 _log = logging.getLogger(__name__)
 
@@ -311,7 +311,7 @@ class Trials(Callback):
         if not width:
             return
         if state.widen_head(width):
-            state.optimizers["compensation"].state.clear()
+            state.optimizers[HEAD].state.clear()
             colors, generator = state.gaussians["features_dc"].detach(), torch.Generator().manual_seed(0)
             features = initial_features(colors, width, generator)
             replace_parameter(state.gaussians, state.optimizers, FEATURES, features, {})
