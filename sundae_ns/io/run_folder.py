@@ -78,7 +78,7 @@ def prunes_of(run: Path) -> list[dict[str, Any]]:
     """Records of the prunes of a run, given its folder; empty if they cannot be read."""
     try:
         records = json.loads(regular(run / PRUNES).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return []
     return records if isinstance(records, list) and all(isinstance(record, dict) for record in records) else []
 
@@ -91,7 +91,7 @@ def prunes_before(path: Path, step: int) -> list[dict[str, Any]]:
     try:
         with suppress(FileNotFoundError):
             return [record for record in json.loads(regular(path).read_text(encoding="utf-8")) if record["step"] < step]
-    except (ValueError, TypeError, KeyError):
+    except (ValueError, TypeError, KeyError, RecursionError):
         path.replace(path.with_suffix(".damaged.json"))
     return []
 

@@ -199,9 +199,9 @@ def kept_and_seconds(prunes: list[dict[str, Any]]) -> tuple[float | None, float 
     """Ratio of Gaussians that all prunes kept, and their seconds; None where the record is not whole."""
     kept = seconds = None
     if prunes:
-        with suppress(KeyError, TypeError, ZeroDivisionError):
+        with suppress(KeyError, TypeError, ArithmeticError):
             kept = math.prod(prune["after"] / prune["before"] for prune in prunes)
-        with suppress(KeyError, TypeError, ValueError):
+        with suppress(KeyError, TypeError, ValueError, ArithmeticError):
             seconds = sum(float(prune["seconds"]) for prune in prunes)
     return kept, seconds
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sundae_ns.core.errors import CheckpointError
+from sundae_ns.core.errors import CheckpointError, one_line, regular
 from sundae_ns.core.tables import MEGABYTE, table
 
 RECORD = "trials.json"  # in the folder of a run
@@ -47,7 +47,7 @@ def read_count_curve(folder: Path) -> CountCurve | None:
     """
     path, names = folder / RECORD, {entry.name for entry in fields(CurvePoint)}
     try:
-        record = json.loads(path.read_text(encoding="utf-8")).get("count")
+        record = json.loads(regular(path).read_text(encoding="utf-8")).get("count")
         if record is None:
             return None
         points = [{name: point[name] for name in names} for point in record["curve"]]
@@ -58,8 +58,8 @@ def read_count_curve(folder: Path) -> CountCurve | None:
         return CountCurve(int(record["chosen"]), int(record["full"]), str(record["reason"]), curve)
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise CheckpointError(f"{path} cannot be read ({error}); remove it, or train the run again") from error
+    except (OSError, ArithmeticError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise CheckpointError(f"{path} cannot be read ({one_line(error)}); remove it, or train again") from error
 
 
 def expected_change(points: Sequence[CurvePoint], count: int, other: int) -> tuple[float, float] | None:

@@ -68,7 +68,7 @@ def test_records_follow_a_resumed_run(tmp_path):
     assert prunes_of(new) == []  # its own record
 
 
-DAMAGED = ("[", "", "3", '"step"', "[3]", "\x00", '{"before": 9}', '[{"step": 3}, 3]')
+DAMAGED = ("[", "[" * 100_000, "", "3", '"step"', "[3]", "\x00", '{"before": 9}', '[{"step": 3}, 3]')
 
 
 @pytest.mark.parametrize("text", [*DAMAGED, '[{"before": 9}]', '[{"step": "3"}]'])

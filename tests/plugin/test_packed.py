@@ -193,6 +193,7 @@ def test_runs_that_cannot_be_packed(tmp_path):
         ([], (None, None)),
         ([{"before": 100, "after": 50, "seconds": 1}, {"after": 40}], (None, None)),
         ([{"before": 0, "after": 0, "seconds": 1}], (None, 1)),
+        ([{"before": 1, "after": 10**400, "seconds": 10**400}], (None, None)),
         ([{"before": "many", "after": 1, "seconds": "long"}], (None, None)),
     ],
 )

@@ -94,8 +94,8 @@ def test_the_record_of_trials_is_read_or_refused_in_one_line(tmp_path):
     path = tmp_path / "trials.json"
     path.write_text(json.dumps({"count": COUNT}))
     assert read_count_curve(tmp_path) == CountCurve(240, 1000, COUNT["reason"], (CurvePoint(**POINT),))
-    wrong = ({"chosen": "many"}, {"curve": [{"count": 3}]}, {"curve": [{**POINT, "psnr": "x"}]})
-    for content in ("", "[]", *(json.dumps({"count": {**COUNT, **each}}) for each in wrong)):
+    wrong = ({"chosen": "many"}, {"chosen": 1e999}, {"curve": [{"count": 3}]}, {"curve": [{**POINT, "psnr": "x"}]})
+    for content in ("", "[]", "[" * 100_000, *(json.dumps({"count": {**COUNT, **each}}) for each in wrong)):
         path.write_text(content)
-        with pytest.raises(CheckpointError, match=r"trials\.json cannot be read .*; remove it, or train the run again"):
+        with pytest.raises(CheckpointError, match=r"trials\.json cannot be read .*; remove it, or train again"):
             read_count_curve(tmp_path)
