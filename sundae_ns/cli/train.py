@@ -36,6 +36,8 @@ class TrainOptions(Wishes):
         if self.method not in methods():
             raise ConfigError(f"{self.method} is no method of sundae; use one of {', '.join(methods())}")
         self.check_wishes()
+        if self.count is not None and self.cleans:
+            raise ConfigError(f"a training reaches --count before {self.cleans[0]} cuts; give both to sundae pack")
         check_least(steps=(self.steps, 1))
 
     def words(
@@ -75,8 +77,7 @@ class TrainOptions(Wishes):
 
 def methods() -> list[str]:
     """Names of this package's methods in ``ns-train``."""
-    points = entry_points(group="nerfstudio.method_configs")
-    return sorted(point.name for point in points if point.value.startswith("sundae_ns."))
+    return sorted(e.name for e in entry_points(group="nerfstudio.method_configs") if e.value.startswith("sundae_ns."))
 
 
 def train(
@@ -118,8 +119,7 @@ def train(
     if resume or given is None:
         more[:0] = ["--timestamp", name]
     # Refuses a damaged capture before runs are mentioned.
-    tunes = has_gpu()
-    words = options.words(capture, out, more, tunes=tunes, masks=masks)
+    words = options.words(capture, out, more, tunes=(tunes := has_gpu()), masks=masks)
     if not resume and old is not None and not (old / PACKED).exists():
         print(f"# {old} ended after {step:,} of {length:,} steps; this is a new run; to resume the other, add --resume")
     code = run_command(words)

@@ -159,9 +159,8 @@ def test_prune_by_the_cameras_of_files(tmp_path, capsys):
         seen = re.search(rf"{number} cameras see ([\d.]+)% of the Gaussians(; if the cameras are not in)?", text)
         assert (seen[2] is not None) == (float(seen[1]) < 92) == (name == "transforms.json")
         assert "50 of 200 Gaussians" in text
-    assert (
-        run("prune", tmp_path / "a.ply", "-o", tmp_path / "transforms.json", "--cameras", tmp_path, "--overwrite") == 2
-    )
+    onto = tmp_path / "transforms.json"
+    assert run("prune", tmp_path / "a.ply", "-o", onto, "--cameras", tmp_path, "--overwrite") == 2
 
 
 @pytest.mark.parametrize(("name", "asked"), [("a.ply", 0.1), ("a.spz", 0.02), ("a.sundae", 0.012), ("a.html", 0.25)])

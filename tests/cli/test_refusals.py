@@ -102,6 +102,7 @@ REFUSALS = {
     "render in.sundae -o damaged.json/new/a.png": "damaged.json is no folder; choose another",
     "train scene --keep 0": "keep is 0.0",
     "train scene --steps 0": "steps is 0",
+    "train scene --count 9 --crop 0 0 0 1 1 1": "reaches --count before --crop cuts; give both to sundae pack",
     "train scene --method splatfacto": "splatfacto is no method of sundae; use one of sundae, ",
     "train gone": "gone does not exist",
     "train empty": "empty has no transforms.json; ",

@@ -54,9 +54,8 @@ def test_an_image_of_a_stored_view(folder, tmp_path, index):
     expected = (255 * sn.render(scene, scene.cameras[index]).rgb).round().byte().numpy()
     assert expected.std() > 5
     assert np.array_equal(pixels(out), expected)
-    assert (
-        run(folder / "cloud.ply", "--cameras", folder / "packed.sundae", "-o", out, "--view", index, "--overwrite") == 0
-    )
+    words = (folder / "cloud.ply", "--cameras", folder / "packed.sundae", "-o", out, "--view", index)
+    assert run(*words, "--overwrite") == 0
     assert np.abs(pixels(out).astype(int) - expected).mean() < 5  # of packing
 
 
