@@ -204,13 +204,13 @@ def _finest_level(path: Path, entry: Entry, size: int) -> tuple[dict[str, Tensor
     if (version := meta.get("version", 1)) not in (1, "1"):
         raise DataError(f"{path} has version {version} of streamed SOG, this program reads 1; update it")
     files: dict[str, list[tuple[int, int]]] = {}  # offset and number of the rows of each leaf
-    nodes = [meta["tree"]]
+    nodes, names = [meta["tree"]], dict(enumerate(meta["filenames"]))  # no index counts from the end
     while nodes:
         node = nodes.pop()
         nodes += node.get("children", ())
         if levels := node.get("lods"):
             finest = levels[min(levels, key=int)]
-            files.setdefault(meta["filenames"][finest["file"]], []).append((finest["offset"], finest["count"]))
+            files.setdefault(names[finest["file"]], []).append((finest["offset"], finest["count"]))
     if meta.get("environment"):
         files[meta["environment"]] = []
     parts: list[dict[str, Tensor]] = []

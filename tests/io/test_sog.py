@@ -258,6 +258,7 @@ HOSTILE = {
     "leaves that share Gaussians": (_streamed((0, 100), (99, 51)), "leaves share Gaussians of 0/meta.json"),
     "a leaf beyond its chunk": (_streamed((100, 51)), "leaves share Gaussians of 0/meta.json, or it has fewer"),
     "a negative leaf": (_streamed((-50, 50)), "leaves share Gaussians of 0/meta.json"),
+    "a chunk from the end": (_streamed((0, 150), tree={"lods": {"0": {"file": -1, "offset": 0, "count": 150}}}), "-1"),
     "no chunk": (_streamed((0, 150), environment=None, filenames=["1/meta.json"]), "no item named .1/meta.json"),
     "many chunks of few bytes": (_many_chunks, "would unpack to"),
     "deep JSON": (_with("meta.json", b"[" * 999_999), "recursion"),
