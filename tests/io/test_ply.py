@@ -98,6 +98,8 @@ SAME = {
     ),
     "other letters": _header(b"element", COMMENT),
     "capital letters": _header(b"element vertex 9\nproperty float x", b"ELEMENT Vertex 9\nproperty FLOAT X"),
+    "an indent and a sign": _header(b"element vertex 9", b"\t element  vertex +9"),
+    "an indented coefficient": _header(b"property float f_rest_20", b"  property  float f_rest_20"),
     "spaces at the ends of lines": _header(b"element", b"element", b" \n"),
     "lines of DOS": _header(b"element", COMMENT, b"\r\n"),
     "lines of old Macs": _header(b"element", COMMENT, b"\r"),
