@@ -177,7 +177,7 @@ ALL_MARKS = Marks(True, True, (0.6, 0.0, 0.8), (1e6 / 3, 0.1, -4e6))
         (["antialiased 0", "SplatRenderMode: 2dgs", "antialiased edges are nice"], Marks()),
         (["Vertical axis: 0 -2 0"], Marks(up=(0.0, -1.0, 0.0))),
         (["vertical AXIS: 3, 0, 4"], Marks(up=(0.6, 0.0, 0.8))),
-        *(([mark], Marks(up=(0.0, -1.0, 0.0))) for mark in ("Vertical axis: -y", "axes: -y up")),
+        *(([mark], Marks(up=(0.0, -1.0, 0.0))) for mark in ("Vertical axis: -y", "axes: -y up", "worldUpVec=0,-2,0")),
         *(([mark], Marks(up=(0.0, 0.0, 1.0))) for mark in UPWARDS.split("|")),
         (["up to 3 0 0", "Updated: 0 0 1"], Marks()),
         (["Exported from Brush", "Vertical axis: y"], Marks(up=(0.0, -1.0, 0.0))),
