@@ -62,11 +62,11 @@ def export(
     if page and upright:
         raise ConfigError("a page turns the scene upright by itself; leave out --upright")
     if not page and (beside is not None or views or advanced.start_view is not None):
-        raise ConfigError("only a page shows two scenes, named views or a start view; name it .html, or no suffix")
+        raise ConfigError("only a page shows two scenes, views or a start view; name it .html; sn.merge joins two")
     before, changes, costs = opened(scene, wishes, advanced, capture=page or lod), wishes.cleans or wishes.reduces, True
     copies, file = before.copies_rows(out), out
     if copies and (upright or not changes):
-        raise ConfigError(f"{scene} is a .ply already; give an output name that ends in .spz or .sog")
+        raise ConfigError(f"{scene} is a .ply already; name another suffix, or what to change, as --count")
     left = before if page else before.reduced(out)
     if upright and not left.scene.in_model_frame:
         raise ConfigError(f"{scene} is not in nerfstudio's coordinates, which --upright turns; leave it out")

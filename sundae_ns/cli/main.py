@@ -86,7 +86,7 @@ def _dispatch(words: Sequence[str]) -> int:
             raise
         # Of a box of many lines, those that are not indented further; between its rules are parts.
         rows = " ".join(re.findall(r"(?m)^[│ ] {1,5}(\S.*?)\.? *│?$", said.getvalue()))
-        text = re.sub(r" [─-]{9,} ", "; ", rows) or said.getvalue()
+        text = (re.sub(r" [─-]{9,} ", "; ", rows) or said.getvalue()).replace("Expected 1 values", "Give one")
         text = re.sub(r"(Argument helptext: .*)?For full helptext, \w+:? (.*)", r"\2 shows the options", text)
         raise ConfigError(re.sub(r"could not convert .*?: |invalid literal .*?: ", "no number: ", text)) from end
     return chosen()
