@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from enum import Enum
 from functools import cache
@@ -119,15 +119,15 @@ def load_config(path: Path) -> Any:
     ``CheckpointError`` if it cannot be read, or asks for more than classes of nerfstudio, of this package, of torch,
     and of installed plug-ins.
     """
-    config = _read(path, _ConfigLoader)
+    config = _read(path, lambda text: yaml.load(text, Loader=_ConfigLoader))
     find_capture(config, path.absolute().parent)
     return config
 
 
-def _read(path: Path, loader: type[yaml.SafeLoader]) -> Any:
+def _read(path: Path, parse: Callable[[str], Any]) -> Any:
     remedy = "give the folder of a finished run, or its config.yml"
     with reading(path, "a run's config.yml, or of another version", CheckpointError, remedy=remedy, missing=remedy):
-        return yaml.load(regular(path).read_text(encoding="utf-8"), Loader=loader)
+        return parse(regular(path).read_text(encoding="utf-8"))
 
 
 class _ValueLoader(yaml.SafeLoader):
@@ -145,7 +145,7 @@ _ValueLoader.add_multi_constructor(_PYTHON, _make_plain)
 
 def _value(path: Path, *keys: str) -> Any:
     """A plain value of a ``config.yml``, or None; ``CheckpointError`` if the file cannot be read."""
-    value = _read(path, _ValueLoader)
+    value = _read(path, lambda text: yaml.load(text, Loader=_ValueLoader))
     for key in keys:
         value = value.get(key) if isinstance(value, dict) else None
     return value
