@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from itertools import permutations
 from pathlib import Path
 from typing import Any
@@ -125,12 +126,11 @@ def _to_model(scene: Scene | None, content: dict[str, Any], where: str) -> tuple
 
 def is_frame(stated: Any) -> bool:
     """Whether a value states a transform ``[3 or 4, 4]`` and a scale, from a capture's coordinates to a model's."""
-    try:
+    with suppress(DataError, KeyError, TypeError):
         matrix(stated["transform"], (3, 4), "transform", "frame")
         finite(stated["scale"], "scale", "frame", positive=True)
-    except (DataError, KeyError, TypeError):
-        return False
-    return True
+        return True
+    return False
 
 
 def spread(total: int, most: int) -> list[int]:
@@ -173,10 +173,8 @@ def film_views(scene: Scene, *, seconds: float = 12.0, frames_per_second: float 
     cameras = cameras if len(cameras) >= 3 else front_views(dataclasses.replace(scene, up=unit(up)))
     poses = np.array([camera.pose.double().tolist() for camera in cameras])
     eyes, ahead = poses[:, :, 3], -poses[:, :, 2]
-    # One unit of motion counts as much as a turn by a radian.
     scale = max(float(np.median(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1))), 1e-9)
-    keys = _tour(np.hstack([eyes / scale, ahead]))
-    path = _even(keys, up, count)
+    path = _even(_tour(np.hstack([eyes / scale, ahead])), up, count)  # a unit of motion counts as a turn by a radian
     centers = torch.from_numpy(path[:, :3] * scale)
     moved = poses_looking_at(centers, centers + torch.from_numpy(path[:, 3:]), torch.from_numpy(up))
     lens = lens.zoomed(min(1280 / max(lens.width, lens.height), 1.0))

@@ -32,9 +32,7 @@ from sundae_ns.scene.virtual_cameras import by_device, virtual_cameras
 HELD_OUT = 16  # cameras that tell what a change costs
 PIXELS = {"cpu": 1 << 18, "cuda": 1 << 20}  # most of their images, by the device
 LOOKING = 64  # virtual cameras that tell what is seen of a scene without cameras
-_PRODUCER = re.compile(
-    rb'"generator"\s*:\s*"([^"]{1,200})"|^comment ([^\r\n]* (?:by|from) [^\r\n]{1,200})', re.M | re.I
-)
+_PRODUCER = re.compile(rb'(?im)"generator"\s*:\s*"([^"]{1,200})"|^comment ([^\r\n]* (?:by|from) [^\r\n]{1,200})')
 
 
 def held_out_cameras(scene: Scene, cameras: Sequence[Camera], count: int = HELD_OUT, *, seed: int = 0) -> list[Camera]:

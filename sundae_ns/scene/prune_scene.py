@@ -313,8 +313,7 @@ def prune_to_bytes(
             print(f"the whole scene takes {len(left[2]) / MEGABYTE:.2f} MB, less than was asked for", file=sys.stderr)
         return left
     counts = [min(n, int((AIM * most - fixed) / each)) for fixed, each in lines]
-    possible = [(form, count) for form, count in zip(forms, counts, strict=True) if count > 0]
-    if not possible:
+    if counts[-1] < 1:
         raise ConfigError(f"a file without Gaussians has {lines[-1][0]:,.0f} bytes; ask for more than {most:,}")
     console, images = Console(stderr=True) if sys.stderr.isatty() else None, list[Tensor]()
     graph = gaussian_graph(scene.gaussians, rule) if rule.uses_graph and n > 1 else None
@@ -325,8 +324,13 @@ def prune_to_bytes(
     def cut(count: int) -> PrunedScene:
         return prune_with_mask(scene, None, count, cameras, rule, fit=False, weights=weights, graph=graph)
 
-    candidates = ((form, cut(count)) for form, count in possible)
-    form, pruned = next(candidates) if len(possible) == 1 else _nearest_form(scene, candidates, cameras, packs)
+    if packs and counts[0] > 0:  # more fit where they are much denser than those that were counted
+        size = bytes_of(cut(counts[0]), forms[0])
+        counts = [min(n, int(count * AIM * most / size)) for count in counts]
+        if 2 * counts[0] > n and bytes_of(whole_scene, forms[0]) <= most:
+            return rounded(whole_scene, forms[0])
+    candidates = ((form, cut(count)) for form, count in zip(forms, counts, strict=True) if count > 0)
+    form, pruned = next(candidates) if len(forms) == 1 else _nearest_form(scene, candidates, cameras, packs)
 
     @cache
     def fit(pruned: PrunedScene) -> PrunedScene:  # colours make up for the harmonics that go
