@@ -1,7 +1,7 @@
 """Pruning of a scene by what cameras see of it, without photographs, also to a size.
 
 What a file of a size holds is a trade: more Gaussians, or more bits for each. So a few :class:`Form` are tried, each
-with as many Gaussians as fit by a sample, and the one whose images are nearest to those of the full scene is taken.
+with as many Gaussians as fit by samples, and the one whose images are nearest to those of the full scene is taken.
 Contributions and the graph are computed once. What is taken is then fitted, and rounded or counted to the size.
 """
 
