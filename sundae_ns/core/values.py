@@ -91,7 +91,7 @@ def fitting() -> Iterator[None]:
         with usual_defaults():
             yield
     except (TypeError, ValueError, AttributeError, LookupError, ArithmeticError, RuntimeError, OSError) as error:
-        unfit = f"{type(error).__name__} {error}".startswith(("NotImpl", "RuntimeError Boolean value of"))  # by torch
+        unfit = isinstance(error, NotImplementedError) or str(error).startswith("Boolean value of Tensor")  # by torch
         if isinstance(error, (SundaeError, RuntimeError, OSError)) and not (unfit or getattr(error, "filename", None)):
             raise
         raise ConfigError(f"an argument does not fit ({one_line(error)}); the docstring says what to give") from error

@@ -63,7 +63,7 @@ def newest_step(path: Path) -> int | None:
     if not path.is_file():
         with suppress(CheckpointError):
             path, _ = newest_whole(path)
-    return int(match[1]) if (match := _NAME.fullmatch(path.name)) else None
+    return int(match[1]) if path.is_file() and (match := _NAME.fullmatch(path.name)) else None
 
 
 def write(state: Mapping[str, Any], path: Path) -> None:

@@ -23,7 +23,7 @@ show_log()  # all commands that train or open a run load these classes
 
 RATES = {"means": 1.6e-4, "features_dc": 0.0025, "features_rest": 0.0025 / 20, "opacities": 0.05, "scales": 0.005}
 RATES |= {"quats": 0.001, "features": 0.0025}  # Learning rates by parameter, splatfacto's
-HARMONICS_EVERY = 2  # One step in so many trains the harmonics, at this multiple of their rate: 8% less time
+HARMONICS_EVERY = 2  # Steps from one that trains the harmonics to the next; their rate grows as much: 8% less time
 METRICS_EVENT = "Train Metrics Dict"  # Event of nerfstudio's trainer with the metrics of a training image
 LINE_EVERY = 10.0  # Seconds between two lines
 

@@ -58,16 +58,16 @@ def rasterize_cameras(inputs: Inputs, viewmats: Tensor, Ks: Tensor, *, backend: 
     _check(singles[0])
     if isinstance(backend, GsplatBackend) and len(inputs.means):
         return backend.rasterize_cameras(inputs, viewmats, Ks)
-    images = each_view(backend.rasterize, singles, two_at_once=inputs.means.is_cpu and not torch.is_grad_enabled())
+    images = (two_at_once if inputs.means.is_cpu and not torch.is_grad_enabled() else map)(backend.rasterize, singles)
     return torch.stack([image.colors for image in images])
 
 
-def each_view(function: Callable[[Any], T], views: Iterable[Any], *, two_at_once: bool) -> Iterator[T]:
-    """Results of a function for each view; ``two_at_once`` on a CPU, where each takes half of the threads."""
-    torch.set_num_threads(threads := torch.get_num_threads())  # two at once cannot make the pool of a forked process
+def two_at_once(function: Callable[[Any], T], views: Iterable[Any]) -> Iterator[T]:
+    """As ``map``, for views on a CPU: two at a time, each on half of the threads."""
+    torch.set_num_threads(threads := torch.get_num_threads())  # two threads cannot make the pool of a forked process
     try:
         with ThreadPoolExecutor(2, initializer=torch.set_num_threads, initargs=(max(1, threads // 2),)) as pool:
-            yield from (pool.map if two_at_once else map)(function, views)
+            yield from pool.map(function, views)
     finally:
         torch.set_num_threads(threads)
 

@@ -14,7 +14,7 @@ from sundae_ns.core.errors import DataError
 from sundae_ns.core.gaussians import FEATURES, MAX_SH_DEGREE, Gaussians
 from sundae_ns.head.head import CompensationHead, ScalePlan, plan, resize
 from sundae_ns.pruning.scores import pixel_detail
-from sundae_ns.rasterize.interface import blending_weights, each_view, harmonic_colors, rasterize
+from sundae_ns.rasterize.interface import blending_weights, harmonic_colors, rasterize, two_at_once
 from sundae_ns.rasterize.reference import BLUR, FOV_MARGIN
 from sundae_ns.rasterize.types import Backend, Inputs, Rasterization, check_memory
 
@@ -220,7 +220,7 @@ def contribution(
         image = None if images is None else torch.cat([splatted.colors.detach(), splatted.alpha.detach()], dim=2).half()
         return rows, torch.autograd.grad(blended, colors)[0][:, 0], image
 
-    views = each_view(of_view, cameras, two_at_once=total.is_cpu)
+    views = (two_at_once if total.is_cpu else map)(of_view, cameras)
     for rows, new, image in track(views, label, len(cameras), transient=True, console=console, disable=not console):
         total[rows] += new
         if images is not None and count is not None:  # only a pass that weights by detail renders the image

@@ -53,7 +53,7 @@ class TrainingState:
     averages_from: float = math.inf  # Step at which the mean of the weights begins, with which the training ends
     provisional: bool = False  # Whether a trial is trained whose field may be dropped
     restored: int = 0  # Number of times in this process that other weights took the place of the trained ones
-    harmonics_every: int = 1  # One step in so many trains the harmonics beyond the base colours
+    harmonics_every: int = 1  # Steps from one that trains the harmonics beyond the base colours to the next
     sh_degree_interval: int | None = None  # Steps after which the next SH degree is enabled; None enables all at once
 
     @property
