@@ -6,7 +6,7 @@ A checkpoint is a zip archive of ``torch.save``, as nerfstudio writes it:
     data/N     bytes of tensor N, stored, not deflated
 
 ``pipeline`` has the tensors by ``_model.gauss_params.NAME`` and ``_model.networks.head.NAME``, and
-``_model._extra_state``, see :func:`extra_state`. No code of files runs; their checksums are verified first.
+``_model._extra_state``, see :func:`check_extra_state`. No code of files runs; their checksums are verified first.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from sundae_ns.core.gaussians import SPLAT_NAMES, Encoding, Gaussians, odd_shape
 EXTRA_STATE = "_extra_state"
 _NO_CLOCK = "the checkpoint does not say where training stopped; give another"
 FORMAT = 2
+OURS = {"method": "sundae", "format": FORMAT}
 _PREFIX = "gauss_params."
 _NAME = re.compile(r"step-(\d+)\.ckpt")
 # What pickles of tensors name; torch's own list has makers of gigabytes from a number, such as bytearray.
@@ -144,18 +145,13 @@ def _open_newest(folder: Path) -> tuple[Path, BinaryIO, list[str]]:
     raise CheckpointError(f"{folder} holds no whole checkpoint{reasons}; give the folder of a run that saved one")
 
 
-def extra_state(**entries: Any) -> dict[str, Any]:
-    """State of a model beside its tensors: plain numbers, strings, and tensors.
-
-    ``step``; ``num_features`` as configured, 0 without a head; ``encoding`` of colours; ``running`` with the states of
-    ``densification`` and ``pruning``; ``extensions`` with those of the callbacks, by name; ``trained_focal``, the
-    shortest and the longest focal length that the head was trained at, pixels; ``head_enabled``.
-    """
-    return {"method": "sundae", "format": FORMAT, **entries}
-
-
 def check_extra_state(state: Mapping[str, Any], num_features: int, encoding: Encoding) -> Mapping[str, Any]:
-    """The state beside the tensors in a model's ``state``, checked against the model's features and encoding."""
+    """The state beside the tensors in a model's ``state``, checked against the model's features and encoding.
+
+    It has :data:`OURS`; ``step``; ``num_features`` as configured, 0 without a head; ``encoding`` of colours;
+    ``running`` with the states of ``densification`` and ``pruning``; ``extensions`` with those of the callbacks, by
+    name; ``trained_focal``, the shortest and longest focal length of the head's training, pixels; ``head_enabled``.
+    """
     extra = state.get(EXTRA_STATE)
     if not isinstance(extra, Mapping) or extra.get("method") != "sundae":
         kind = "a splatfacto checkpoint" if _PREFIX + "means" in state else "the checkpoint of another method"

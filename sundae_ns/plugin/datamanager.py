@@ -28,7 +28,6 @@ from sundae_ns.core.errors import ConfigError, DataError, SundaeError, one_line,
 from sundae_ns.data.images import TURNED, check_image, decoded, decoded_mask, exif_orientation, turned, wrong_size
 from sundae_ns.data.layouts import larger_model, unused_masks
 from sundae_ns.plugin.dataparsers import check_cameras, check_capture, check_ranges, check_tests, rebound, set_parser
-from sundae_ns.train.progress import warn
 
 _log = logging.getLogger(__name__)
 
@@ -171,9 +170,9 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         folder = folder.parent if folder.is_file() else folder
         if outputs.mask_filenames is None and (masks := unused_masks(folder)) is not None:
             how = f"colmap --masks-path {masks}" if is_colmap else "mask_path in each frame of transforms.json"
-            warn(f"{folder / masks} is not used; to leave out what its masks hide, give {how}")
+            _log.warning(f"{folder / masks} is not used; to leave out what its masks hide, give {how}")
         if is_colmap and (larger := larger_model(folder, parser.colmap_path)) is not None:
-            warn(larger)
+            _log.warning(larger)
         transform = outputs.dataparser_transform.clone()
         # nerfstudio states the translation after the scale that a capture has been given.
         transform[:, 3] /= getattr(self.dataparser, "applied_scale", 1.0)

@@ -9,8 +9,8 @@ are others; everything else, to the bit, is nerfstudio's.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 from itertools import compress
 from pathlib import Path
 from types import FunctionType, SimpleNamespace
@@ -36,7 +36,10 @@ from sundae_ns.data.lenses import DISTORTION, INTRINSICS, KINDS, PERSPECTIVE, Le
 from sundae_ns.data.photos import copies
 from sundae_ns.io.ply import read_point_cloud
 from sundae_ns.scene.load_save import FRAME_FILE
-from sundae_ns.train.progress import warn
+from sundae_ns.train.progress import show_log
+
+show_log()  # all commands that train or open a run load this module
+_log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
@@ -176,8 +179,7 @@ class _PosedParser:
             return outputs
         transform = outputs.dataparser_transform.double()
         transform[:, 3] -= self._transform[:, :3].double() @ torch.from_numpy(self.offset)
-        known = {entry.name: getattr(outputs, entry.name) for entry in fields(outputs)}
-        return _SurveyOutputs(**{**known, "dataparser_transform": transform})
+        return _SurveyOutputs(**{**outputs.as_dict(), "dataparser_transform": transform})
 
     def _shift(self, frames: list[dict[str, Any]], points: Callable[[], Array | None], where: str) -> None:
         """Make the poses of frames float64 and rigid, near the origin if float32 is too coarse where they stand.
@@ -282,7 +284,7 @@ class LightNerfstudioParser(_PosedParser, Nerfstudio):
             if rounded and _float32_step(finite) > COARSE_STEP:
                 step = np.spacing(np.float32(np.abs(self.offset).max()))
                 what = f"{ply_file_path.name} has float32 coordinates that are {step:.2g} apart"
-                warn(f"{what}, as it lies far from the origin; export it with double coordinates, or shifted")
+                _log.warning(f"{what}, as it lies far from the origin; export it with double coordinates, or shifted")
             points = points.double() - torch.from_numpy(self.offset)
         points = points.float() @ transform_matrix[:3, :3].T + transform_matrix[:3, 3]
         # nerfstudio multiplies by applied_scale again, but the file's cloud is in the coordinates of its cameras.
@@ -372,14 +374,15 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
         values = f"fl_x {fl_x:.3g}, cx {cx:.3g}, cy {cy:.3g} at a width of {w:.0f} px"
         raise DataError(f"{next(compress(names, strange)).name} has {values}, which no lens has; give all in pixels")
     if (aside.amin(dim=1) > 0.24).all():
-        warn("cx and cy lie far from the middle of all images; if they are of images of another size, scale them")
+        what = "cx and cy lie far from the middle of all images"
+        _log.warning(f"{what}; if they are of images of another size, scale them")
     if points is not None:
         warn_of_cloud(points, cameras)
     centres = cameras.camera_to_worlds[:, :, 3]
     middle = centres.median(dim=0).values
     distances = (centres - middle).norm(dim=1)
     if len(names) > 1 and distances.max() == 0:
-        warn("all cameras stand at one place, so nothing says how far things are; check the poses")
+        _log.warning("all cameras stand at one place, so nothing says how far things are; check the poses")
         return
     usual = distances.median()
     cloud = centres[:0] if points is None else points.cpu()
@@ -390,8 +393,8 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
             far &= distances > STRAY * float((cloud.double() - middle).norm(dim=1).median())
     if far.any():
         times = f"{float(distances[far][0] / usual):,.0f} times as far away as most"
-        which = f"{next(compress(names, far)).name} is {times if usual > 0 else 'far from all others'}"
-        warn(f"the camera of {which} ({int(far.sum())} of {len(names)} are); check its pose, or remove the view")
+        which = f"the camera of {next(compress(names, far)).name} is {times if usual > 0 else 'far from all others'}"
+        _log.warning(f"{which} ({int(far.sum())} of {len(names)} are); check its pose, or remove the view")
 
 
 def check_tests(train: Any, test: Any) -> None:
@@ -400,12 +403,12 @@ def check_tests(train: Any, test: Any) -> None:
     twice = copies(path for path in dict.fromkeys([*train.image_filenames, *names]) if path.is_file())
     if shared := {path for path in names if twice.get(path, path) in {*train.image_filenames}}:
         which = f"{min(shared).name} is a training image and a test view ({len(shared)} of {len(names)} test views are)"
-        warn(f"{which}, so figures are better than those of new views; list each image once, in one split")
+        _log.warning(f"{which}, so figures are better than those of new views; list each image once, in one split")
     centres = torch.cat([data.cameras.camera_to_worlds[:, :, 3] for data in (train, test)]).double().cpu()
     far = torch.from_numpy(stray_cameras(centres.numpy()))[-len(names) :]
     if far.any():
         which = f"{next(compress(names, far)).name}, a test view, stands far from all others"
-        warn(f"the camera of {which} ({int(far.sum())} of {len(names)} do); check its pose, or remove the view")
+        _log.warning(f"the camera of {which} ({int(far.sum())} of {len(names)} do); check its pose, or remove the view")
 
 
 def check_projection(camera: Cameras) -> None:
@@ -431,8 +434,8 @@ def warn_of_cloud(points: Tensor, cameras: Cameras) -> None:
         across, down = (x * fx / -z + cx) / width, (-y * fy / -z + cy) / height
         empty += not ((z < 0) & (across > -0.1) & (across < 1.1) & (down > -0.1) & (down < 1.1)).any()
     if empty > 0.5 * len(cameras):
-        what = f"{empty} of {len(cameras)} views show no point of the sparse cloud"
-        warn(f"{what}: both are probably in different coordinates; export them together, or remove ply_file_path")
+        what = f"{empty} of {len(cameras)} views show no point of the sparse cloud: both are probably in different"
+        _log.warning(f"{what} coordinates; export them together, or remove ply_file_path")
 
 
 def warn_of_other_frame(run: Path, transform: Tensor, scale: float) -> None:
@@ -445,7 +448,7 @@ def warn_of_other_frame(run: Path, transform: Tensor, scale: float) -> None:
         return
     if not same:
         what = f"{run} was trained in other coordinates: its capture has changed, or another version scaled it"
-        warn(f"{what}; if cameras stand far apart, resume it with --pipeline.datamanager.robust-frame False")
+        _log.warning(f"{what}; if cameras stand far apart, resume it with --pipeline.datamanager.robust-frame False")
 
 
 def camera_of(camera: Cameras, device: torch.device | str, *, pose: Tensor | None = None, downscale: int = 1) -> Camera:

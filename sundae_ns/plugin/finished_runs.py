@@ -7,12 +7,11 @@ capture; each one is checked, and a new configuration is made from them.
 from __future__ import annotations
 
 import copy
-import dataclasses
 import math
 import re
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
 
@@ -122,15 +121,15 @@ def load_model(
 def _in_views_of(like: Opened, path: Path, scene: Scene) -> Opened:
     """A file in the test views of another scene; of the model's and the capture's coordinates, those that fit."""
     device, subset = like.model.device, slice(None, None, len(like.cameras) // 4 + 1)
-    scene = dataclasses.replace(scene, background_color=like.model.config.background_color)
+    scene = replace(scene, background_color=like.model.config.background_color)
     if not scene.in_model_frame:  # which few formats state
         matrix, scale = like.datamanager.train_dataset.metadata[DATASET_FRAME]
         moved = transform(scene, matrix[:, :3], scale, scale * matrix[:, 3])
         views = like.truths[subset], [like.model.camera_of(camera) for camera in like.cameras[subset]]
         scene = max((scene, moved), key=lambda each: measure(each.to(device), *views).psnr)
     model, size = model_of(scene).to(device), path.stat().st_size
-    opened = dataclasses.replace(like, model=model, source=path, variant=path.name, packed_bytes=size)
-    return dataclasses.replace(opened, method="", steps=0, kept=None, seed=None, prune_s=None, pipeline=None)
+    opened = replace(like, model=model, source=path, variant=path.name, packed_bytes=size)
+    return replace(opened, method="", steps=0, kept=None, seed=None, prune_s=None, pipeline=None)
 
 
 def _open_file(path: Path, scene: Scene, data: Path | None) -> Opened:
@@ -138,7 +137,7 @@ def _open_file(path: Path, scene: Scene, data: Path | None) -> Opened:
         raise DataError(f"{path} does not name its capture; give the capture with --data")
     config = datamanager_of(scene, data)
     if "capture" not in scene.meta and isinstance(config.dataparser, BlenderDataParserConfig):
-        scene = dataclasses.replace(scene, background_color="white")  # as `sundae train` reads this layout
+        scene = replace(scene, background_color="white")  # as `sundae train` reads this layout
     model = model_of(scene).to(fastest_device())
     manager = config.setup(device=model.device, test_mode="test", world_size=1, local_rank=0)
     source = stated if isinstance(stated := scene.meta.get("source"), dict) else {}
@@ -175,7 +174,7 @@ def _open_run(path: Path, data: Path | None, split: Literal["test", "val"]) -> O
     kept, seconds = (1.0, 0.0) if model.config.pruning.mode == "off" else kept_and_seconds(prunes_of(path.parent))
     method, variant = config.method_name or "", config.experiment_name or ""
     opened = Opened(model, pipeline.datamanager, path.parent, capture, method, variant, step + 1)
-    return dataclasses.replace(opened, kept=kept, seed=config.machine.seed, prune_s=seconds, pipeline=pipeline)
+    return replace(opened, kept=kept, seed=config.machine.seed, prune_s=seconds, pipeline=pipeline)
 
 
 def _config_of(path: Path) -> TrainerConfig:
@@ -213,7 +212,7 @@ def _shared(config: Any, kind: type[Any]) -> dict[str, Any]:
 def model_of(scene: Scene) -> SundaeModel:
     """The model of a scene in evaluation mode, on the CPU, with all SH degrees and the head enabled."""
     degree = 0 if scene.gaussians.encoding == "logits" else max(scene.gaussians.sh_degree, 1)
-    head = HeadConfig(mode="off") if scene.head is None else dataclasses.replace(scene.head.config, start_at=0)
+    head = HeadConfig(mode="off") if scene.head is None else replace(scene.head.config, start_at=0)
     look: Any = {"rasterize_mode": "antialiased" if scene.antialiased else "classic"}
     look |= {"background_color": scene.background_color, "sh_degree": degree, "sh_degree_interval": 1}
     config = SundaeModelConfig(head=head, **look)
@@ -264,7 +263,7 @@ def load_run(run: Path, *, max_cameras: int = 100, data: Path | None = None) -> 
     if up is None and cameras:
         with suppress(ConfigError):  # cameras that look all around have none
             up = unit(torch.stack([camera.pose[:, 1] for camera in cameras]).double().mean(dim=0).tolist())
-    return dataclasses.replace(scene, cameras=cameras, up=up, meta=meta)
+    return replace(scene, cameras=cameras, up=up, meta=meta)
 
 
 def describe_capture(manager: SundaeDatamanagerConfig) -> dict[str, Any] | None:

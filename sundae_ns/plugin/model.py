@@ -156,17 +156,18 @@ class SundaeModel(SplatfactoModel):
     # -------------------------------------------------------------------------------------------------- checkpoints
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Everything beside tensors that a resumed run needs: clock, running states, states of the callbacks."""
+        """Everything beside tensors that a resumed run needs, see :func:`.check_extra_state`."""
         state = self.state
-        return checkpoint.extra_state(
-            step=state.step,
-            num_features=self.config.num_features,
-            encoding=state.gaussians.encoding,
-            running=state.running_states(),
-            extensions={callback.name: dict(callback.state_dict()) for callback in self.train_callbacks},
-            trained_focal=state.trained_focal and list(state.trained_focal),
-            head_enabled=state.head_enabled,
-        )
+        return {
+            **checkpoint.OURS,
+            "step": state.step,
+            "num_features": self.config.num_features,
+            "encoding": state.gaussians.encoding,
+            "running": state.running_states(),
+            "extensions": {callback.name: dict(callback.state_dict()) for callback in self.train_callbacks},
+            "trained_focal": state.trained_focal and list(state.trained_focal),
+            "head_enabled": state.head_enabled,
+        }
 
     def set_extra_state(self, state: Mapping[str, Any]) -> None:
         """Counterpart of :meth:`get_extra_state`; tensors move to the device of the Gaussians."""

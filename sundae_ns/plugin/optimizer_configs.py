@@ -16,10 +16,8 @@ from nerfstudio.utils.writer import EVENT_STORAGE, GLOBAL_BUFFER, EventName, Loc
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR, LRScheduler
 
-from sundae_ns.train.progress import TimeLeft, duration, show_log
+from sundae_ns.train.progress import TimeLeft, duration
 from sundae_ns.train.schedules import FULL_RATE_INPUTS, NETWORK_BETAS, Decay, DecayShape, fused_adam, network_groups
-
-show_log()  # all commands that train or open a run load these classes
 
 RATES = {"means": 1.6e-4, "features_dc": 0.0025, "features_rest": 0.0025 / 20, "opacities": 0.05, "scales": 0.005}
 RATES |= {"quats": 0.001, "features": 0.0025}  # Learning rates by parameter, splatfacto's

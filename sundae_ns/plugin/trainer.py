@@ -27,7 +27,6 @@ from sundae_ns.core.files import write_text
 from sundae_ns.core.values import usual_defaults
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.io import checkpoint, run_folder
-from sundae_ns.io.checkpoint import random_state, set_random_state
 from sundae_ns.io.config_file import find_capture
 from sundae_ns.plugin import distributed
 from sundae_ns.plugin.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
@@ -36,7 +35,7 @@ from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.plugin.optimizer_configs import HARMONICS_EVERY, FusedAdamConfig
 from sundae_ns.plugin.viewer import stop_rendering
 from sundae_ns.train.graphed_step import RecordedStep
-from sundae_ns.train.progress import Interruption, loaded_run, long_on_cpu, resume_command, warn
+from sundae_ns.train.progress import Interruption, loaded_run, long_on_cpu, resume_command
 from sundae_ns.train.schedules import schedule_table, set_schedule
 
 _log = logging.getLogger(__name__)
@@ -251,7 +250,7 @@ class SundaeTrainer(Trainer):
         elif number == 11 and self.config.machine.device_type == "cpu":
             seconds = (time.perf_counter() - self._measured_from) / 10
             if (warning := long_on_cpu(seconds, self.last_step - self._start_step - 11)) is not None:
-                warn(warning)
+                _log.warning(warning)
 
     def _stop(self) -> None:
         if self.ranks.count == 1:  # several stop together
@@ -295,7 +294,7 @@ class SundaeTrainer(Trainer):
                 "optimizers": {name: value.state_dict() for name, value in self.optimizers.optimizers.items()},
                 "schedulers": {name: value.state_dict() for name, value in self.optimizers.schedulers.items()},
                 "scalers": self.grad_scaler.state_dict(),
-                "random": random_state(),
+                "random": checkpoint.random_state(),
             }
             path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
             checkpoint.write(state, path)
@@ -318,7 +317,7 @@ class SundaeTrainer(Trainer):
                 self.optimizers.load_schedulers(loaded["schedulers"])
             self.grad_scaler.load_state_dict(loaded["scalers"])
             if "random" in loaded:  # nerfstudio's own trainer saves none
-                set_random_state(loaded["random"])
+                checkpoint.set_random_state(loaded["random"])
         _log.info(f"Resuming after step {loaded['step']} from {path}")
         outputs = self._datamanager.train_dataparser_outputs
         warn_of_other_frame(path.parent.parent, outputs.dataparser_transform, outputs.dataparser_scale)
@@ -332,5 +331,5 @@ class SundaeTrainer(Trainer):
             return checkpoint.folder_of(saved) / f"step-{step:09d}.ckpt"
         path, passed_over = checkpoint.newest_whole(saved)
         for line in passed_over:
-            warn(f"skipped a damaged checkpoint: {line}")
+            _log.warning(f"skipped a damaged checkpoint: {line}")
         return path

@@ -17,14 +17,13 @@ from sundae_ns.data.capture import read_json
 from sundae_ns.head.head import SIZES, CompensationHead, HeadConfig
 from sundae_ns.io import checkpoint, formats
 from sundae_ns.io.config_file import find_config, model_options, orientation_of
-from sundae_ns.io.formats import FORMATS, kind_of
 from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.io.ply import Marks
 from sundae_ns.scene.cameras import is_frame
 from sundae_ns.scene.page import opened_page, packed_of, shown_as, write_page
 from sundae_ns.scene.scene import Scene
 
-SUFFIXES = (*FORMATS, ".sundae", ".html")  # of the files that save() writes
+SUFFIXES = (*formats.FORMATS, ".sundae", ".html")  # of the files that save() writes
 FRAME_FILE = "dataparser_transforms.json"  # of nerfstudio, in the folder of a run
 
 
@@ -55,7 +54,7 @@ def load(path: Path | str, *, device: torch.device | str = "cpu") -> Scene:
 
 def load_with_mask(path: Path, device: torch.device | str = "cpu") -> tuple[Scene, Tensor | None]:
     """As :func:`load`, with True for the Gaussians of a file that the scene has, bool ``[N]``; None for others."""
-    if (kind := kind_of(path)) == "packed" or (kind is None and path.suffix.lower() == ".sundae"):
+    if (kind := formats.kind_of(path)) == "packed" or (kind is None and path.suffix.lower() == ".sundae"):
         from sundae_ns.io.pack.packed_scene import read_scene
         from sundae_ns.scene.packing import scene_of  # its decoder needs a compiler, which other files do not
 
@@ -104,9 +103,9 @@ def save(scene: Scene, path: Path | str, *, upright: bool = False, config: PackC
     path, suffix = Path(path), Path(path).suffix.lower()
     if suffix not in SUFFIXES:
         raise ConfigError(f"{path} has no supported suffix; name it {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
-    if upright and suffix not in FORMATS:
+    if upright and suffix not in formats.FORMATS:
         raise ConfigError(f"{suffix} files keep their coordinates; leave out upright")
-    if suffix in FORMATS:
+    if suffix in formats.FORMATS:
         formats.write_for_viewers(path, scene.gaussians, marks_of(scene), upright=upright)
     elif suffix == ".html":
         write_page(path, shown_as(path.resolve().stem, scene, config))

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -53,7 +52,7 @@ class Scene:
     """The camera that the web page opens with, on the CPU; None for the first stored one."""
     in_model_frame: bool = False
     """Whether coordinates are those of nerfstudio's model; otherwise of a capture or of another program."""
-    meta: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    meta: Mapping[str, Any] = field(default_factory=dict)
     """JSON values that a packed scene carries along: ``frame``, ``capture``, ``source``."""
     __iter__ = None  # a scene is no list of Gaussians, nor of scenes
 
@@ -155,7 +154,7 @@ class Scene:
         if not fits:
             kind = f"{str(index.dtype).removeprefix('torch.')} {list(index.shape)}"
             raise DataError(f"rows are {kind}; give a slice, a mask, bool [{n}], or indices [M] from 0 to {n - 1}")
-        return dataclasses.replace(self, gaussians=self.gaussians.rows(index.to(self.device)))
+        return replace(self, gaussians=self.gaussians.rows(index.to(self.device)))
 
     @property
     def means(self) -> Tensor:
@@ -213,10 +212,10 @@ class Scene:
         if self.head is not None:
             # No deep copy: on a GPU the head keeps recorded CUDA graphs, which cannot be copied.
             with torch.random.fork_rng(devices=[]):
-                head = CompensationHead(dataclasses.replace(self.head.config))
+                head = CompensationHead(replace(self.head.config))
             head.load_state_dict(self.head.state_dict())
             head = head.train(self.head.training).to(device)
-        return dataclasses.replace(self, gaussians=self.gaussians.to(device), head=head)
+        return replace(self, gaussians=self.gaussians.to(device), head=head)
 
     @fitting()
     def settings(self, backend: BackendName = "auto", *, head: bool = True) -> RenderSettings:
@@ -388,7 +387,7 @@ def measure(
     if not cameras:
         raise DataError("there is no view to measure in; give cameras, such as sundae_ns.virtual_cameras(scene)")
     if isinstance(reference, Scene):
-        scene = dataclasses.replace(scene, background_color=reference.background_color)
+        scene = replace(scene, background_color=reference.background_color)
         targets = (render(reference, camera, head=head, backend=backend).rgb for camera in cameras)
     else:
         several = isinstance(reference, Iterable) and not isinstance(reference, (str, Path, Rendering))

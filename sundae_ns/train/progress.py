@@ -38,12 +38,6 @@ def show_log() -> None:
         log.setLevel(logging.INFO)
 
 
-def warn(text: str) -> None:
-    """Show a warning of the shell."""
-    show_log()
-    logging.getLogger("sundae_ns").warning(text)
-
-
 LONG = 1800.0  # Seconds of a training on a CPU that are worth a warning
 
 

@@ -6,13 +6,12 @@ those that nobody set by hand to another length; nothing else in the package kno
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import math
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -331,9 +330,9 @@ def _free(config: Any, usual: Any, given: Collection[str], names: Iterable[str])
 
 def _leaves(config: Any, prefix: str) -> list[str]:
     """Dotted names of all options in a configuration and in those that it holds."""
-    if not dataclasses.is_dataclass(config):
+    if not is_dataclass(config):
         return [prefix]
-    names = [entry.name for entry in dataclasses.fields(config) if entry.name != "_target"]
+    names = [entry.name for entry in fields(config) if entry.name != "_target"]
     return [leaf for name in names for leaf in _leaves(getattr(config, name), f"{prefix}.{name}")]
 
 

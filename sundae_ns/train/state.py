@@ -5,10 +5,9 @@ Nothing here knows nerfstudio.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, TypeAlias
 
 import torch
@@ -35,14 +34,14 @@ class TrainingState:
 
     gaussians: Gaussians  # The Gaussians of this process
     networks: torch.nn.ModuleDict  # Holds the head, if there is one; registered by the model, so in checkpoints
-    optimizers: Mapping[str, Optimizer] = dataclasses.field(default_factory=dict)
+    optimizers: Mapping[str, Optimizer] = field(default_factory=dict)
     """By parameter name; the head's is :data:`HEAD`."""
-    schedulers: Mapping[str, LRScheduler] = dataclasses.field(default_factory=dict)
+    schedulers: Mapping[str, LRScheduler] = field(default_factory=dict)
     """By the same names, where rates change."""
-    densification: dict[str, Any] = dataclasses.field(default_factory=dict)
+    densification: dict[str, Any] = field(default_factory=dict)
     """Running state of densification; tensors ``[N, ...]`` and plain numbers."""
-    pruning: dict[str, Any] = dataclasses.field(default_factory=dict)  # Running state of pruning: plain integers
-    info: dict[str, Any] = dataclasses.field(default_factory=dict)
+    pruning: dict[str, Any] = field(default_factory=dict)  # Running state of pruning: plain integers
+    info: dict[str, Any] = field(default_factory=dict)
     """What the rasteriser says of the last training image, with gradients after the backward pass."""
     trained_focal: tuple[float, float] | None = None  # Shortest and longest focal length that the head has seen, pixels
 
@@ -101,7 +100,7 @@ class TrainingState:
         assert self.head is not None
         changes = self.head.config.num_features != num_features
         if changes:
-            self.head.resize(dataclasses.replace(self.head.config, num_features=num_features))
+            self.head.resize(replace(self.head.config, num_features=num_features))
         return changes
 
     def render_settings(

@@ -25,16 +25,10 @@ def model_state(n=6, degree=3, **extra):
     state = {f"gauss_params.{name}": value for name, value in small_field(n, degree).items()}
     state["gauss_params.features"] = torch.zeros(n, 5)
     state[HEAD] = torch.zeros(4, 4)
-    about = checkpoint.extra_state(
-        step=7,
-        num_features=5,
-        encoding="harmonics",
-        running={"densification": {"grad2d": None}, "pruning": {"pruned_at": -1}},
-        extensions={},
-        head_enabled=False,
-        trained_focal=None,
-    )
-    state["_extra_state"] = {**about, **extra}
+    running = {"densification": {"grad2d": None}, "pruning": {"pruned_at": -1}}
+    about = {"step": 7, "num_features": 5, "encoding": "harmonics", "running": running}
+    about |= {"extensions": {}, "head_enabled": False, "trained_focal": None}
+    state["_extra_state"] = {**OURS, **about, **extra}
     return state
 
 

@@ -9,8 +9,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from dataclasses import field as default
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -49,9 +48,9 @@ class PackedScene:
     """All that is needed to render a scene."""
 
     gaussians: dict[str, Tensor]  # see core.gaussians; float32 on the CPU
-    head: dict[str, Tensor] = default(default_factory=dict)  # its state; empty without a head
+    head: dict[str, Tensor] = field(default_factory=dict)  # its state; empty without a head
     cameras: dict[str, Tensor] | None = None  # by the names of CAMERAS
-    meta: dict[str, Any] = default(default_factory=dict)  # JSON: the model's configuration, frame, and other entries
+    meta: dict[str, Any] = field(default_factory=dict)  # JSON: the model's configuration, frame, and other entries
     sensitivity: Sensitivity | None = None  # what errors do to images; not stored; without it all weigh the same
 
 
