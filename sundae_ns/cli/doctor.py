@@ -96,8 +96,7 @@ def _checked(name: str, check: Callable[[], str | None], remedy: str, purpose: s
         found, problem = None, "not installed"
     except SundaeError as error:
         found, problem = None, str(error)
-    text = found or problem
-    return Part(name, bool(found), f"{text}, for {purpose}" if purpose else text, remedy)
+    return Part(name, bool(found), (found or problem) + (f", for {purpose}" if purpose else ""), remedy)
 
 
 def _cuda() -> str:

@@ -12,8 +12,8 @@ from sundae_ns.cli.inputs import opened
 from sundae_ns.cli.options import Advanced, File, Flag, Out, Plain, Scene, SceneDetails, Wishes, progress_bar
 from sundae_ns.cli.refusals import check_file, check_folder, check_suffix
 from sundae_ns.core.errors import ConfigError
-from sundae_ns.core.gaussians import sh_degree
-from sundae_ns.io.formats import FORMATS, kind_of, write_for_viewers, write_levels
+from sundae_ns.io.formats import FORMATS, kind_of, write_levels
+from sundae_ns.io.ply import MAX_SH_DEGREE
 from sundae_ns.io.run_folder import files_of
 from sundae_ns.io.sog import STREAMED
 from sundae_ns.rasterize.interface import fastest_device
@@ -63,24 +63,25 @@ def export(
         raise ConfigError("a page turns the scene upright by itself; leave out --upright")
     if not page and (beside is not None or views or advanced.start_view is not None):
         raise ConfigError("only a page shows two scenes, views or a start view; name it .html; sn.merge joins two")
-    before, changes, costs = opened(scene, wishes, advanced, capture=page or lod), wishes.cleans or wishes.reduces, True
-    copies, file = before.copies_rows(out), out
+    before = opened(scene, wishes, advanced, capture=page or lod)
+    copies, changes = before.copies_rows(out), bool(wishes.cleans or wishes.reduces)
     if copies and (upright or not changes):
         raise ConfigError(f"{scene} is a .ply already; name another suffix, or what to change, as --count")
-    left = before if page else before.reduced(out)
-    if upright and not left.scene.in_model_frame:
+    if upright and not before.scene.in_model_frame:
         raise ConfigError(f"{scene} is not in nerfstudio's coordinates, which --upright turns; leave it out")
+    left = before if page else before.reduced(out, write=lambda edit, path: edit.write(path, upright=upright))
+    file, costs = out if suffix else out / (STREAMED if lod else "scene.sundae"), True
     if page:
         second = [] if beside is None else [opened(beside, Wishes(), SceneDetails(), capture=True).for_page()]
         named = {name: link for name, _, link in (word.partition("=") for word in views)}
         first = before.for_page(out, lambda path, first: write_page(path, first, *second, views=named))
-        size, file = write_page(out, first, *second, views=named), out if suffix else out / "scene.sundae"
+        size = write_page(out, first, *second, views=named)
         print(f"{out}: {size:,} bytes; {'open it in a browser' if suffix else 'serve it'}")
         costs = kind_of(scene) != "packed" or first[1] is not before.scene
     elif lod:
         from sundae_ns.plugin.distill import levels_of  # imports nerfstudio, which takes seconds
 
-        levels, file = [left.scene.to(fastest_device())], out / STREAMED
+        levels = [left.scene.to(fastest_device())]
         with progress_bar() as bar:
             task = bar.add_task("Levels of detail", total=None)
             trained = levels_of(levels[0], left.scene.cameras, lambda i, n: bar.update(task, completed=i, total=n))
@@ -94,13 +95,14 @@ def export(
         print(f"{out}: {left.scene.num_gaussians:,} of {len(left.rows):,} Gaussians")
     else:
         with Console(stderr=True).status(f"Writing {left.scene.num_gaussians:,} Gaussians"):  # a .sog takes minutes
-            written = write_for_viewers(out, left.stated.gaussians, marks_of(left.stated), upright=upright)
-        mode, degree = ", antialiased" if left.scene.antialiased else "", sh_degree(written["features_rest"])
-        print(f"{out}: {len(written['means']):,} Gaussians, degree {degree}{mode}, {out.stat().st_size:,} bytes")
-        if degree < left.stated.gaussians.sh_degree:
+            left.write(out, upright=upright)
+        stated, mode = left.stated.gaussians.sh_degree, ", antialiased" if left.scene.antialiased else ""
+        degree = stated if suffix == ".ply" else min(stated, MAX_SH_DEGREE)
+        print(f"{out}: {left.scene.num_gaussians:,} Gaussians, degree {degree}{mode}, {out.stat().st_size:,} bytes")
+        if degree < stated:
             print(f"left out harmonics above SH degree {degree}, which {suffix} cannot store; .ply can")
         exact = suffix in (".ply", ".glb") and degree == before.scene.gaussians.sh_degree
-        costs = not exact or before.scene.head is not None or bool(changes)
+        costs = not exact or before.scene.head is not None or changes
     if costs:
         before.print_cost(file, upright=upright)
     return 0

@@ -23,8 +23,7 @@ def info(scene: Scene, cameras: File = None, json: Flag = False) -> int:
         json: print one JSON object.
     """
     opened = load(scene).to(fastest_device())
-    chosen, _ = chosen_cameras(opened, cameras, None)
-    facts = describe(opened, scene, chosen, console=Console(stderr=True))
+    facts = describe(opened, scene, chosen_cameras(opened, cameras, None)[0], console=Console(stderr=True))
     if json:
         print(dumps(without_nan(facts)))
         return 0

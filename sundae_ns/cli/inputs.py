@@ -62,15 +62,15 @@ class Edit(NamedTuple):
         """Whether a .ply keeps the rows, properties and comments of another one."""
         return kind_of(self.source) == "ply" and out.suffix.lower() == ".ply" and has_own_columns(self.source)
 
-    def write(self, out: Path) -> None:
-        """Write the scene; a .ply of a .ply keeps its properties and comments."""
+    def write(self, out: Path, *, upright: bool = False) -> None:
+        """Write the scene, ``upright`` from nerfstudio's axes; a .ply of a .ply keeps its properties and comments."""
         if self.file is not None:
             write_bytes(out, self.file)
         elif self.copies_rows(out):
             moved = (self.pruned and self.pruned.moved) or self.form.degree < self.scene.gaussians.sh_degree
             keep_vertices(self.source, out, self.rows, self.stated.gaussians if moved else None, self.scene.up)
         else:
-            save(self.stated, out, config=self.form.precision)
+            save(self.stated, out, upright=upright, config=self.form.precision)
 
     def cut(self, mask: Tensor) -> Edit:
         """With the Gaussians of a mask."""
@@ -135,17 +135,19 @@ class Edit(NamedTuple):
             if wishes.max_mb is None:
                 return after(prune_with_mask(scene, wishes.keep, count, cameras, rule, progress=True))
             forms = Form.choices(scene, out.suffix.lower())[: None if rounds else 1]
+            warnings: dict[bytes, str] = {}  # by the file whose writing they are of
 
             def file_of(pruned: PrunedScene, form: Form) -> bytes:
-                with redirect_stderr(StringIO()):  # warnings of each try
+                with redirect_stderr(StringIO()) as said:
                     (write or Edit.write)(after(pruned, form), Path(folder, out.name))
-                return b"".join(path.read_bytes() for path in Path(folder).rglob("*") if path.is_file())
+                file = b"".join(part.read_bytes() for part in Path(folder).rglob("*") if part.is_file())
+                warnings[file] = said.getvalue().replace(folder, str(out.parent))
+                return file
 
-            most = int(wishes.max_mb * MEGABYTE)
             with TemporaryDirectory() as folder:
-                pruned, form, file = prune_to_bytes(scene, most, file_of, forms, cameras, rule)
-            # A .spz is written again, which warns of what it clamps.
-            return after(pruned, form)._replace(file=None if out.suffix.lower() == ".spz" else file)
+                pruned, form, file = prune_to_bytes(scene, int(wishes.max_mb * MEGABYTE), file_of, forms, cameras, rule)
+            print(warnings[file], end="", file=sys.stderr)
+            return after(pruned, form)._replace(file=file)
 
     def for_page(self, out: Path = Path("page.html"), write: Callable[[Path, Shown], object] = write_page) -> Shown:
         """Name, scene and packed file of what a page shows, which ``write`` makes; a packed scene stays as it is."""

@@ -41,7 +41,6 @@ Rest = Annotated[tuple[str, ...], tyro.conf.Positional, NO_DEFAULT, tyro.conf.ar
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]  # without a --no- form
 Overwrite = Annotated[Flag, tyro.conf.arg(help="replace an earlier output, once the new one is complete.")]
-Box = tuple[float, float, float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ class Wishes:
     """number of Gaussians to keep, in place of a share."""
     max_mb: Float = None
     """size of the finished file in MB, its head and the code of a page included, in place of a share."""
-    crop: Annotated[Box | None, _optional(float, "X Y Z X Y Z"), NO_DEFAULT] = None
+    crop: Annotated[tuple[float, ...] | None, _optional(float, "X Y Z X Y Z"), NO_DEFAULT] = None
     """keep the Gaussians whose centres are in this box, in the file's coordinates: lowest x y z, then highest."""
     remove_floaters: Annotated[Float, tyro.conf.arg(metavar="[0 to 1]")] = None
     """remove what floats, and what no camera of the photographs sees: from 0, what surely does, to 1; bare 0.25."""

@@ -16,7 +16,6 @@ from sundae_ns.cli.options import Advanced, Flag, Float, Out, Plain, Scene, Scen
 from sundae_ns.cli.refusals import check_exclusive, check_file, check_least
 from sundae_ns.core.errors import ConfigError, SundaeError
 from sundae_ns.core.tables import MEGABYTE, without_nan
-from sundae_ns.io.config_file import check_run
 from sundae_ns.io.formats import PRIMITIVES, kind_of, kind_of_gaussians
 from sundae_ns.io.pack.config import FINETUNED, FINETUNED_SIZE, PackConfig
 from sundae_ns.io.pack.packed_scene import Codecs, PackedScene, fit_scene, pack_bytes, write_fitted
@@ -52,37 +51,35 @@ def pack(
     Args:
         out: file to write, for example scene.sundae.
     """
-    finetune, target_drop, max_mb = advanced.finetune, advanced.target_drop, wishes.max_mb
+    steps, target_drop, max_mb = advanced.finetune, advanced.target_drop, wishes.max_mb
     wishes.check_wishes()
     check_exclusive(max_mb=max_mb, target_drop=target_drop)
-    check_least(max_cameras=(advanced.max_cameras, 0), finetune=(finetune, 0), target_drop=(target_drop, 0.001))
-    if wishes.cleans and (finetune or target_drop is not None):
+    check_least(max_cameras=(advanced.max_cameras, 0), finetune=(steps, 0), target_drop=(target_drop, 0.001))
+    if wishes.cleans and (steps or target_drop is not None):
         raise ConfigError(f"--finetune and --target-drop need the whole scene; leave out {wishes.cleans[0]}, or them")
     check_file(out, reads=[*files_of(run), advanced.data, advanced.cameras], overwrite=advanced.overwrite)
     packed = kind_of(run) == "packed" or (run.suffix.lower() == ".html" and run.is_file())
-    if (kind := "packed" if packed else kind_of_gaussians(run)) is None:
-        check_run(run)
-    elif of_photos := words_of(advanced, "finetune", "target_drop", "data"):
+    kind = "packed" if packed else kind_of_gaussians(run)
+    if kind is not None and (of_photos := words_of(advanced, "finetune", "target_drop", "data")):
         name = PRIMITIVES.get(kind, "packed scene")
         raise ConfigError(f"{run} is a {name} without photos; leave out {of_photos[0]}, or give a run")
     before = opened(run, wishes, advanced, capture=True, most=advanced.max_cameras)
     # A fine-tune shrinks the file, and the search below rounds it to its size.
-    larger = None if max_mb is None else max_mb / (FINETUNED_SIZE if finetune else 1)
+    larger = None if max_mb is None else max_mb / (FINETUNED_SIZE if steps else 1)
     asked = before._replace(wishes=replace(wishes, max_mb=larger))
-    left = asked.reduced(out.with_suffix(".sundae"), rounds=not finetune)
+    left = asked.reduced(out.with_suffix(".sundae"), rounds=not steps)
     source, packs = contents_of(left.stated), list[tuple[PackedScene, Codecs]]()
     figures: dict[str, Any] = {}
     with progress_bar() as bar, redirect_stdout(StringIO()):  # nerfstudio's messages
-        task = bar.add_task("Fine-tuning" if finetune else "Packing", total=2 + finetune)
+        task = bar.add_task("Fine-tuning" if steps else "Packing", total=2 + steps)
         if kind is None:
-            from sundae_ns.plugin.tuned_packs import Judge, Search, best_pack
-            from sundae_ns.plugin.tuned_packs import finetune as tune
+            from sundae_ns.plugin.tuned_packs import Judge, Search, best_pack, finetune
 
             judge, progress = cache(lambda: Judge(run, advanced.data)), lambda _: bar.advance(task)
-        if finetune:
-            packs.append(tune(run, source, FINETUNED, finetune, data=advanced.data, progress=progress))
+        if steps:
+            packs.append(finetune(run, source, FINETUNED, steps, data=advanced.data, progress=progress))
         bar.update(task, description="Packing")
-        if (finetune and max_mb is not None) or target_drop is not None:
+        if (steps and max_mb is not None) or target_drop is not None:
             # Starts from the source, because positions of a fitted pack are rounded.
             searches = [Search(source, PackConfig(), judge), *(Search(*each, judge) for each in packs)]
             most = None if max_mb is None else int(max_mb * MEGABYTE)
@@ -95,7 +92,7 @@ def pack(
         report = write_fitted(out, *packs[0])
         bar.update(task, advance=1, description="Measuring")
         if kind is None and wishes.crop is None:  # photos show what a box leaves out
-            figures = _measured(judge, packs, finetune)
+            figures = _measured(judge, packs, steps)
     if advanced.json:
         print(dumps(without_nan({"file": str(out), **report.summary(), **figures})))
         return 0
@@ -106,13 +103,13 @@ def pack(
     if not figures:
         before.print_cost(out)
         return 0
-    (psnr, packed), (ssim, packed_ssim) = figures["psnr"], figures["ssim"]
-    change = f"PSNR {psnr:.2f} -> {packed:.2f} dB, SSIM {ssim:.4f} -> {packed_ssim:.4f}, before and after"
+    (psnr, packed_psnr), (ssim, packed_ssim) = figures["psnr"], figures["ssim"]
+    change = f"PSNR {psnr:.2f} -> {packed_psnr:.2f} dB, SSIM {ssim:.4f} -> {packed_ssim:.4f}, before and after"
     print(f"{change}, on {figures['views']} of {figures['test_views']} test views")
     return 0
 
 
-def _measured(judge: Callable[[], Judge], packs: Sequence[tuple[PackedScene, Codecs]], finetune: int) -> dict[str, Any]:
+def _measured(judge: Callable[[], Judge], packs: Sequence[tuple[PackedScene, Codecs]], steps: int) -> dict[str, Any]:
     """Figures of the run and of the first pack; a second pack is that without the fine-tune."""
     from sundae_ns.plugin.tuned_packs import is_worth
 
@@ -125,7 +122,7 @@ def _measured(judge: Callable[[], Judge], packs: Sequence[tuple[PackedScene, Cod
     size, *sizes = (len(pack_bytes(*pack)[0]) for pack in packs)
     for other, plain in zip(others, sizes, strict=True):
         if not is_worth(after.psnr, size, other.psnr, plain):
-            lost = f"the fine-tune of {finetune:,} steps loses {before.psnr - after.psnr:.2f} dB"
+            lost = f"the fine-tune of {steps:,} steps loses {before.psnr - after.psnr:.2f} dB"
             other_lost = f"a pack without it has {plain:,} bytes and loses {before.psnr - other.psnr:.2f} dB"
             print(f"{lost}; {other_lost}: give more steps, or leave out --finetune", file=sys.stderr)
     figures = {"psnr": [before.psnr, after.psnr], "ssim": [before.ssim, after.ssim]}

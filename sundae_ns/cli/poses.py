@@ -116,6 +116,6 @@ def _interruptible(work: Callable[[], Placed], folder: Path) -> Placed:
             said = "" if os.environ.get(STEP) else "sundae: interrupted; the same command continues here\n"
             print(f"{cursor}{said}", end="", file=sys.stderr, flush=True)
             os._exit(130)
-        except BaseException as error:
+        except Exception as error:  # COLMAP raises many kinds
             remedy = f"remove {shlex.quote(word(folder))} and start again, or report it"
             raise DataError(f"COLMAP failed ({one_line(error)}); {remedy}") from error

@@ -96,8 +96,8 @@ def _distilled(edit: Edit, out: Path, steps: int | None) -> int:
     wishes, details, scene = edit.wishes, edit.details, edit.scene.to(fastest_device())
     near = None if details.cameras is None else edit.cameras
     options: dict[str, Any] = {"keep": wishes.keep, "count": wishes.count, "cameras": near, "steps": steps}
-    options |= {"seed": details.seed or 0, "head": not details.no_head, "progress": True}
-    training, partial = Distillation(scene, **options), out.with_name(f"{out.name}.partial")
+    training = Distillation(scene, **options, seed=details.seed or 0, head=not details.no_head, progress=True)
+    partial = out.with_name(f"{out.name}.partial")
     if partial.exists():
         training.load(partial)
         print(f"resuming after step {training.step:,} of {training.steps:,}, with {partial}", file=sys.stderr)

@@ -180,8 +180,8 @@ def run(project: Plain[Project]) -> int:
 
 def carry_out(project: Project) -> int:
     """Take the steps of a project that are not done; the exit code."""
-    out = project.out
-    for number, step in enumerate(plan := project.plan(), start=1):
+    out, plan = project.out, project.plan()
+    for number, step in enumerate(plan, start=1):
         heading = f"# step {number} of {len(plan)}, {step.name}"
         if _passes(step.check):
             print(f"{heading}: done", flush=True)

@@ -77,7 +77,7 @@ class TrainOptions(Wishes):
 
 def methods() -> list[str]:
     """Names of this package's methods in ``ns-train``."""
-    return sorted(e.name for e in entry_points(group="nerfstudio.method_configs") if e.value.startswith("sundae_ns."))
+    return sorted(entry_points(group="nerfstudio.method_configs", module="sundae_ns.method_configs").names)
 
 
 def train(
@@ -109,8 +109,9 @@ def train(
     if not is_posed(capture) and capture.suffix != ".json" and not any(map(_is_parser, further)):
         raise no_transforms(capture)
     check_folder(out, reads=[], overwrite=True)
-    (old, step, length), more = unfinished_run(out, options.method, capture) or (None, 0, 0), list(further)
-    name = (given := _value_of("--timestamp", more)) or new_name()
+    old, step, length = unfinished_run(out, options.method, capture) or (None, 0, 0)
+    more, given = list(further), _value_of("--timestamp", further)
+    name = given or new_name()
     if resume:
         if old is None:
             raise ConfigError(f"{out} has no unfinished run of {options.method} on {capture}; leave out --resume")
@@ -118,8 +119,9 @@ def train(
         more[:0] = [f"--experiment-name={old.parent.parent.name}", "--load-dir", word(old / "nerfstudio_models")]
     if resume or given is None:
         more[:0] = ["--timestamp", name]
+    tunes = has_gpu()
     # Refuses a damaged capture before runs are mentioned.
-    words = options.words(capture, out, more, tunes=(tunes := has_gpu()), masks=masks)
+    words = options.words(capture, out, more, tunes=tunes, masks=masks)
     if not resume and old is not None and not (old / PACKED).exists():
         print(f"# {old} ended after {step:,} of {length:,} steps; this is a new run; to resume the other, add --resume")
     code = run_command(words)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import logging
 import re
 import subprocess
 import sys
@@ -166,13 +167,18 @@ def test_prune_by_the_cameras_of_files(tmp_path, capsys):
 @pytest.mark.parametrize(("name", "asked"), [("a.ply", 0.1), ("a.spz", 0.02), ("a.sundae", 0.027), ("a.html", 0.25)])
 def test_a_size_that_was_asked_for_binds(name, asked, tmp_path, capsys, monkeypatch):
     """With a box, a direction and a page in the same command; if all Gaussians fit, none goes, and a line says so."""
+    monkeypatch.setattr(logging.getLogger("sundae_ns"), "handlers", [logging.lastResort])
     monkeypatch.setattr("sundae_ns.scene.prune_scene.refit", noted := Mock(side_effect=pruning.refit))
     monkeypatch.setattr(pruning, "SAMPLED", (8, 32) if name == "a.sundae" else pruning.SAMPLED)
     points = torch.rand(3000, 3, generator=torch.Generator().manual_seed(0))
-    sn.save(sn.Scene.from_points(points, points, sh_degree=2), tmp_path / "in.ply")
+    scene = sn.Scene.from_points(points, points, sh_degree=2)
+    scene.gaussians["features_dc"][: 40 * (name == "a.spz")] = -3.34
+    sn.save(scene, tmp_path / "in.ply")
     words = ["prune", tmp_path / "in.ply", "-o", tmp_path / name, "--num-cameras", "2", "--up", "0", "1", "0"]
     assert run(*words, "--max-mb", asked, "--crop", "0", "0", "0", "1", "1", "0.9") == 0
-    size, (kept,) = (tmp_path / name).stat().st_size, re.findall("([0-9,]+) of 3,000", capsys.readouterr().out)
+    size, said = (tmp_path / name).stat().st_size, capsys.readouterr()
+    (kept,) = re.findall("([0-9,]+) of 3,000", said.out)
+    assert said.err.count(f"{name} clamps") == (name == "a.spz"), "of all tries, the written file is heard"
     assert 0.97 * asked <= size / 1e6 <= asked
     assert (2600 if name == "a.sundae" else 100) < int(kept.replace(",", "")) < 2710  # a pack holds nearly all
     assert sn.load(tmp_path / name).gaussians.sh_degree == (degree := 0 if name in ("a.ply", "a.spz") else 2)

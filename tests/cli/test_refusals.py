@@ -72,7 +72,7 @@ REFUSALS = {
     "pack in.ply -o a.sundae --target-drop 1 --remove-floaters": "leave out --remove-floaters",
     "prune gone -o a.ply --remove-floaters 1.5": "remove-floaters is 1.5; give 0 (careful) to 1",
     "pack in.ply -o a.sundae --finetune 5 --crop 0 0 0 1 1 1": "leave out --crop",
-    "pack gone -o a.sundae": "gone cannot be read",
+    "pack gone -o a.sundae": "gone does not exist",
     "pack gone -o a.sundae --finetune -1": "finetune is -1",
     "pack gone -o a.sundae --max-cameras -1": "max-cameras is -1",
     "pack gone -o a.sundae --max-mb 0": "max-mb is 0.0",
