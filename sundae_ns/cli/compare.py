@@ -59,6 +59,8 @@ def compare(
     if out is not None:
         check_folder(out, reads=[*scenes, data, cameras], overwrite=overwrite)
     check_least(repeats=(repeats, 0), num_cameras=(num_cameras, 1))
+    if gone := next((path for path in scenes if not path.exists()), None):
+        raise ConfigError(f"{gone} does not exist; check the path")
     scenes = sorted(scenes, key=lambda path: not is_run(path))  # a run says how photos are read
     photos = cameras is None and (data is not None or any(map(is_run, scenes)))
     if len(scenes) < (1 if photos or formats else 2):

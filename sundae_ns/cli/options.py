@@ -23,8 +23,7 @@ NO_DEFAULT = tyro.conf.arg(help_behavior_hint="")  # in the help
 
 def _optional(kind: type[float], metavar: str) -> PrimitiveConstructorSpec[Any]:
     """How numbers that may be left out are read, one a word of the metavar: a union would name None beside them."""
-    several = len(metavar.split()) > 1
-    read = (lambda words: tuple(map(kind, words))) if several else lambda words: kind(words[0])
+    read = (lambda words: tuple(map(kind, words))) if " " in metavar else lambda words: kind(words[0])
     return PrimitiveConstructorSpec(len(metavar.split()), metavar, read, lambda _: True, lambda x: [str(x)])
 
 

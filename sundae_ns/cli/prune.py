@@ -94,10 +94,9 @@ def _distilled(edit: Edit, out: Path, steps: int | None) -> int:
     from sundae_ns.train.progress import Interruption
 
     wishes, details, scene = edit.wishes, edit.details, edit.scene.to(fastest_device())
-    near = None if details.cameras is None else edit.cameras
-    options: dict[str, Any] = {"keep": wishes.keep, "count": wishes.count, "cameras": near, "steps": steps}
-    training = Distillation(scene, **options, seed=details.seed or 0, head=not details.no_head, progress=True)
-    partial = out.with_name(f"{out.name}.partial")
+    options: dict[str, Any] = {"keep": wishes.keep, "count": wishes.count, "steps": steps, "head": not details.no_head}
+    options |= {"cameras": details.cameras and edit.cameras, "seed": details.seed or 0, "progress": True}
+    training, partial = Distillation(scene, **options), out.with_name(f"{out.name}.partial")
     if partial.exists():
         training.load(partial)
         print(f"resuming after step {training.step:,} of {training.steps:,}, with {partial}", file=sys.stderr)

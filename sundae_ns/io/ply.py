@@ -409,8 +409,7 @@ def _ratios(words: NDArray[Any], bits: tuple[int, ...]) -> NDArray[np.float32]:
     """Fields of 32-bit words, from the top bit down, relative to their largest value ``[N, len(bits)]``."""
     shifts = (32 - np.cumsum(bits)).astype(np.uint32)
     largest = ((1 << np.array(bits)) - 1).astype(np.uint32)
-    fields = (words.astype(np.uint32)[:, None] >> shifts) & largest
-    return fields.astype(np.float32) / largest.astype(np.float32)
+    return ((words.astype(np.uint32)[:, None] >> shifts) & largest).astype(np.float32) / largest.astype(np.float32)
 
 
 def from_smallest_three(others: NDArray[Any], largest: NDArray[Any]) -> NDArray[Any]:
@@ -437,11 +436,9 @@ def read_point_cloud(path: Path, *, precise: bool = False) -> tuple[Tensor, Tens
         return points, torch.full((len(points), 3), 128, dtype=torch.uint8)
     colors = _columns(rows, channels)
     if channels == _COLUMNS["features_dc"]:
-        colors = sh_to_rgb(colors)
-        white = 1.0
+        colors, white = sh_to_rgb(colors), 1.0
     else:
         largest = float(colors[colors.isfinite()].max()) if bool(colors.isfinite().any()) else 0.0
-        is_float = rows[channels[0]].dtype.kind == "f"
         # Floats have 1 for white, which some programs overshoot.
-        white = 1.0 if is_float and largest <= 2 else 65535.0 if largest > 255 else 255.0
+        white = 1.0 if rows[channels[0]].dtype.kind == "f" and largest <= 2 else 65535.0 if largest > 255 else 255.0
     return points, (colors * (255 / white)).nan_to_num_(nan=0.0).round_().clamp_(0, 255).to(torch.uint8)

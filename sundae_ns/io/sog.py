@@ -353,8 +353,7 @@ def palette(rows: NDArray[np.float32], max_rows: int = MAX_PALETTE) -> tuple[NDA
     labels = torch.empty(n, dtype=torch.int64)
     for cell in cell_of.unique():
         (members,) = torch.nonzero(cell_of == cell, as_tuple=True)
-        count = min(1 + (max_rows - _COARSE) * len(members) // n, len(members))
-        fine = kmeans(vectors[members], count, generator)
+        fine = kmeans(vectors[members], min(1 + (max_rows - _COARSE) * len(members) // n, len(members)), generator)
         labels[members] = sum(map(len, centres)) + _nearest_centre(vectors[members], fine)
         centres.append(fine)
     return torch.cat(centres).float().numpy(), labels.numpy()

@@ -133,7 +133,7 @@ def decoded(content: bytes, axes: str) -> tuple[dict[str, Tensor], Marks]:
     }
     params = {name: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for name, value in arrays.items()}
     params["opacities"] = torch.logit(torch.from_numpy(alphas / np.float32(255)), eps=LEAST_OPACITY)
-    if flags & 2 and (stated := _stated_axes(memoryview(extensions))):
+    if flags & 2 and (stated := _stated_axes(memoryview(extensions), version)):
         turn = [[float((a == b) - (a == _OPPOSITE[b])) for a in stated] for b in axes]
         params = similarity(params, torch.tensor([[*row, 0.0] for row in turn]), 1.0)
     return params, Marks(bool(flags & 1))
@@ -158,13 +158,17 @@ def _streams(content: bytes, sizes: list[int]) -> tuple[list[bytes], bytes]:
     return parts, content[32:table]
 
 
-def _stated_axes(extensions: memoryview) -> str | None:
+def _stated_axes(extensions: memoryview, version: int) -> str | None:
     """Names of the axes x, y and z by an extension, which numbers them from 1."""
-    while len(extensions) >= 12:
-        kind, size, system = struct.unpack_from("<III", extensions)
-        if kind == _COORDINATE_SYSTEM and system > 0:
+    while version > 3 or len(extensions) >= 8:
+        kind, size = struct.unpack_from("<II", extensions)
+        content, extensions = extensions[8 : 8 + size], extensions[8 + size :]
+        if len(content) < size and (version > 3 or kind == _COORDINATE_SYSTEM):  # the first writers stated no sizes
+            raise ValueError(f"its extensions end {size - len(content):,} bytes early")
+        if kind == _COORDINATE_SYSTEM and (system := struct.unpack("<I", content)[0]) > 0:
             if system > len(_AXES):
                 raise ValueError(f"it states axes number {system}, and known are 1 to {len(_AXES)}")
             return _AXES[system - 1]
-        extensions = extensions[8 + size :]
+        if not extensions:
+            break
     return None

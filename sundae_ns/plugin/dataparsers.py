@@ -167,8 +167,7 @@ class _PosedParser:
             types = torch.tensor([[TYPES[lens.kind]] for lens in lenses], dtype=cameras.camera_type.dtype)
             distortion = torch.tensor([lens.distortion for lens in lenses], dtype=torch.float32)
             # nerfstudio undistorts no lens whose distortion is zero, a fisheye lens neither; this one moves nothing.
-            zero_fisheye = (types != CameraType.PERSPECTIVE.value).flatten() & (distortion == 0).all(dim=1)
-            distortion[zero_fisheye, 0] = 1e-12
+            distortion[(types != CameraType.PERSPECTIVE.value).flatten() & (distortion == 0).all(dim=1), 0] = 1e-12
             cameras.camera_type, cameras.distortion_params = types, distortion
         if self._growth != 1.0 and self.config.auto_scale_poses:
             cameras.camera_to_worlds[:, :, 3] *= self._growth

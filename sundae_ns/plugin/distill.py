@@ -27,7 +27,7 @@ from sundae_ns.plugin.model import SundaeModelConfig
 from sundae_ns.plugin.optimizer_configs import RATES, optimise, rate_factor
 from sundae_ns.scene.prune_scene import prune_with_mask
 from sundae_ns.scene.render import GaussianSource
-from sundae_ns.scene.scene import Scene, initial_features, measure, render
+from sundae_ns.scene.scene import Scene, initial_features, measure, render, usable_cameras
 from sundae_ns.scene.virtual_cameras import VIEWS, by_device, of_unit_size, resized, split, virtual_cameras
 from sundae_ns.train.averaging import AVERAGED_EVERY, RunningMean, weights_of
 from sundae_ns.train.choice import least_gain
@@ -50,6 +50,7 @@ class Distillation:
     """
 
     @usual_defaults()
+    @torch.no_grad()
     def __init__(
         self,
         teacher: Scene,
@@ -64,17 +65,17 @@ class Distillation:
         progress: bool = False,
     ) -> None:
         steps = whole(by_device(STEPS, teacher.device) if steps is None else steps, "steps")
-        if keep is None and count is None:
-            keep = 0.1
+        size = whole(by_device(SIDES, teacher.device) if size is None else size, "size", most=1 << 14)
+        seed = whole(seed, "seed", 0, 1 << 42)
+        keep = 0.1 if keep is None and count is None else keep
         # Its own head, if it has one, corrects its images.
         teacher = dataclasses.replace(teacher, gaussians=sanitise(teacher.gaussians).gaussians)
-        side = size or by_device(SIDES, teacher.device)
-        if cameras:
-            trained, held_out = split(cameras)
-            trained = trained or list(cameras)
+        if cameras is not None:
+            trained, held_out = split(usable_cameras(cameras))
+            trained = trained or held_out
         else:
-            trained = virtual_cameras(teacher, CAMERAS, seed=seed, size=side)
-            held_out = virtual_cameras(teacher, HELD_OUT, seed=seed + 1, size=side)
+            trained = virtual_cameras(teacher, CAMERAS, seed=seed, size=size)
+            held_out = virtual_cameras(teacher, HELD_OUT, seed=seed + 1, size=size)
         self._teacher, scaled, self._size = of_unit_size(teacher, [*trained, *held_out])
         self.cameras, self.held_out = scaled[: len(trained)], scaled[len(trained) :][:HELD_OUT]
         self.steps, self._seed = steps, seed  # Number of steps to train
@@ -179,7 +180,7 @@ class Distillation:
         state = self.state
         camera = self._camera(i)
         # A teacher of nerfstudio's model may have been trained over random backgrounds; the student sees the shown one.
-        target = render(self._teacher, camera).rgb
+        target = torch.no_grad()(render)(self._teacher, camera).rgb
         state.step = i + 1  # a head is enabled in the steps after its start
         inputs = StepInputs(camera, target, None, self._teacher.background)
         settings = state.render_settings(self._settings.backend, antialiased=self._teacher.antialiased, training=True)
@@ -200,7 +201,7 @@ class Distillation:
         viewmat = camera.viewmat.clone()
         viewmat[:3] = turn.to(viewmat) @ viewmat[:3]
         viewmat[:3, 3] += shift.to(viewmat) / math.sqrt(3)
-        return camera._replace(viewmat=viewmat)
+        return camera._replace(viewmat=viewmat, K=camera.K.detach())  # it may be a caller's parameter
 
     def scene(self) -> Scene:
         """The scene as it is now, at unit size if its source is no nerfstudio model."""

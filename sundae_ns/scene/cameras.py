@@ -75,8 +75,7 @@ def read_cameras(path: Path, scene: Scene | None = None) -> tuple[list[Camera], 
         moved = transform[:3, :3] @ pose[:3]
         moved[:, 3] = scale * (moved[:, 3] + transform[:3, 3])
         cameras.append(Camera.from_pose(torch.from_numpy(moved), intrinsics, width, height))
-    speed = finite(content.get("fps", 24), "fps", path.name, positive=True) if read is _of_path else None
-    return cameras, speed
+    return cameras, finite(content.get("fps", 24), "fps", path.name, positive=True) if read is _of_path else None
 
 
 def _of_frame(entry: Any, content: dict[str, Any], where: str) -> Pinhole:

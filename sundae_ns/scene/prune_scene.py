@@ -108,7 +108,7 @@ def prune_with_mask(
     """
     if (keep is None) == (count is None):
         raise ConfigError("prune needs either keep (a share) or count (a number of Gaussians); give one of them")
-    if keep is not None and not 0 < float(numbers(keep, "keep", ())) <= 1:
+    if keep is not None and not 0 < (keep := float(numbers(keep, "keep", ()))) <= 1:
         raise ConfigError(f"keep is {keep}; give a share in (0, 1], 0.1 to keep a tenth")
     rule = rule or PruneRule()
     sanitised = sanitise(scene.gaussians)

@@ -284,6 +284,8 @@ def usable_cameras(cameras: Any) -> tuple[Camera, ...]:
         for matrix, side in zip(camera[:2], (4, 3), strict=True):
             if not isinstance(matrix, Tensor) or matrix.shape != (side, side) or matrix.dtype != torch.float32:
                 raise DataError("the matrices of a camera are no float32 tensors; make it by Camera.from_pose")
+        if not min(whole(value, "a side of a camera") for value in camera[2:4]) * camera.focal > 0:
+            raise DataError(f"the focal length of a camera is {camera.focal}; give a positive number of pixels")
     on_cpu = [camera[:2] for camera in listed if camera.K.device.type == "cpu"]  # the values of others are waited for
     if on_cpu and not _are_pinholes(*(torch.stack(each).detach() for each in zip(*on_cpu, strict=True))):
         raise DataError("a camera is no pinhole without skew, with a finite rotation; make it by Camera.from_pose")

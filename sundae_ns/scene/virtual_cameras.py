@@ -192,8 +192,7 @@ def _probe(gaussians: Gaussians, middle: Tensor, reach: float, generator: torch.
         chance = (_factor(size, _PROBE_GAUSSIANS) * size).clamp(max=1).cpu()
         drawn = torch.rand(len(chance), generator=generator, dtype=torch.float64) < chance
         kept, sizes = gaussians.rows(drawn.to(gaussians["means"].device)), sizes[drawn.to(sizes.device)]
-        grown = kept["scales"] - chance[drawn].log().to(kept["scales"])[:, None] / 2
-        kept = kept.replaced({"scales": grown})
+        kept = kept.replaced({"scales": kept["scales"] - chance[drawn].log().to(kept["scales"])[:, None] / 2})
     moved = (kept["means"].double() - middle.to(kept["means"].device)) / reach
     values = {"means": moved.float(), "scales": kept["scales"] - math.log(reach)}
     return kept.replaced(values), sizes.float()

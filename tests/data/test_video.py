@@ -236,8 +236,6 @@ def panorama(path):
 UNREADABLE = "is not a video that FFmpeg decodes .*; convert it to .mp4"
 REFUSED = {
     "text": (lambda path: path.write_text("not a video"), UNREADABLE),
-    "empty": (lambda path: path.touch(), UNREADABLE),
-    "half": (lambda path: (write_video(path, 40), path.write_bytes(path.read_bytes()[:400])), UNREADABLE),
     "a pipe": (os.mkfifo, "it is a pipe or a device"),
     "sound": (sound, "has no images"),
     "an unknown codec": (replaced(b"avc1", b"zzzz"), "has no images that can be decoded; convert it"),

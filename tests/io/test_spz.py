@@ -61,6 +61,11 @@ def _with_stream(content, size):
     return content[:32] + struct.pack("<Q", len(frame)) + content[40:128] + frame + content[128 + stored :]
 
 
+def _cut(content, count):
+    """Without the last bytes of its extensions, which end at byte 56."""
+    return content[:16] + bytes([56 - count]) + content[17 : 56 - count] + content[56:]
+
+
 FIELD = small_field(100, 1)
 HOSTILE = {
     "a second member": (lambda: spz(FIELD, 3) + gzip.compress(bytes(1 << 27), 1), "unpacks to more"),
@@ -79,6 +84,8 @@ HOSTILE = {
     "version 4 in gzip": (lambda: gzip.compress(spz(FIELD, 4)), "version 1 to 4"),
     "another gzip file": (lambda: gzip.compress(b"ply" * 9), "version 1 to 4; gunzip other files"),
     "99 fractional bits": (lambda: spz(FIELD, 3, bits=99), "version 1 to 4"),
+    "cut axes": (lambda: _cut(spz(FIELD, 4, axes=8), 2), "its extensions end 2 bytes early"),
+    "no axes": (lambda: _cut(spz(FIELD, 4, axes=8), 24), "not a complete .spz .*8 bytes"),
     "unknown axes": (lambda: spz(FIELD, 4, axes=17), "axes number 17, and known are 1 to 16"),
 }
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import sundae_ns as sn
-from sundae_ns.core.errors import CheckpointError, ConfigError
+from sundae_ns.core.errors import CheckpointError
 from sundae_ns.plugin.distill import Distillation
 
 
@@ -39,6 +39,7 @@ def test_it_is_the_same_for_a_seed_and_for_every_default_dtype(ball, cameras):
     found = []
     for seed, dtype in ((0, torch.float32), (0, torch.float64), (1, torch.float32)):
         torch.set_default_dtype(dtype)
+        ball.gaussians["means"].requires_grad_(dtype == torch.float64)
         try:
             made = Distillation(ball, keep=0.1, cameras=cameras, steps=5, seed=seed)
             made.train(lambda *_: True)
@@ -80,7 +81,7 @@ def test_a_head_is_kept_where_it_pays_and_a_resumed_training_ends_alike(pays, ba
         begun().load(tmp_path / "partial")
 
 
-@pytest.mark.parametrize(("name", "value"), [("steps", 0), ("keep", 2.0)])
+@pytest.mark.parametrize(("name", "value"), [("steps", 0), ("keep", 2.0), ("seed", 1.5), ("size", 0), ("cameras", 0)])
 def test_impossible_options_are_refused(name, value, ball, cameras):
-    with pytest.raises(ConfigError, match=f"{name} is {value}"):
-        sn.distill(ball, cameras=cameras, **{name: value})
+    with pytest.raises(sn.SundaeError, match=f"{name} is {value}|'{value}' is no camera"):
+        sn.distill(ball, **{"cameras": cameras, name: value})
