@@ -27,9 +27,8 @@ _SIDE = 512  # longest side of the images that tell what is seen, pixels; the ne
 _FAINT = 0.01  # weight as a share of the mean, below which a Gaussian is hardly seen; 0 tells captures apart less well
 HARDLY_SEEN = 0.17  # share of such Gaussians: up to 0.10 in the captures tried, in other coordinates from 0.27 on
 LEAST_SEEN = 0.92  # share of the Gaussians that cameras of a prune see, else they may be in other coordinates: a guess
+# Logarithms of the least odds of a floater at strengths 0 and 1; by the root of the strength its default is half way.
 _SURE, _DOUBTFUL = 2.0, -6.0
-"""Logarithms of the least odds of a floater at strengths 0 and 1. By the root of the strength its default is half way,
-where ``benchmarks/results/cleaning.csv`` has 97% of the planted floaters."""
 OTHERS = "if the cameras are not in the coordinates of the scene, give those of its own run or capture"
 _log = logging.getLogger(__name__)
 

@@ -1,7 +1,4 @@
-"""Images of finished scenes for viewers: outputs computed on first access, and frames as recorded CUDA graphs.
-
-A graph reads its inputs where they were recorded: Gaussians, the head's weights, camera and background.
-"""
+"""Images of finished scenes for viewers: outputs computed on first access, and frames as recorded CUDA graphs."""
 
 from __future__ import annotations
 
@@ -38,10 +35,7 @@ REPLAYED = ("rgb", "base_rgb", "accumulation")  # images of a recorded frame
 
 
 class LazyOutputs(UserDict[str, Any]):
-    """Named outputs. A function is called on first access, without gradients, and its value kept.
-
-    That may be in another thread, after the model has changed.
-    """
+    """Named outputs. A function is called on first access, perhaps in another thread, and its value kept."""
 
     def __getitem__(self, name: str) -> Any:
         value = self.data[name]
@@ -163,8 +157,8 @@ class FrameReplay:
     ) -> dict[str, Any]:
         """``rgb, base_rgb, accumulation`` of a view, each ``[H, W, C]``, as :func:`.render_view` makes them.
 
-        Replays a recorded frame where possible: on CUDA by gsplat, without gradients, of all Gaussians in this process.
-        Other frames, and the first of a size, are rendered kernel by kernel. Both agree up to the order of sums.
+        Replays a recorded frame where possible: on CUDA by gsplat, without gradients, of all Gaussians in this process,
+        from the second of a size on. Other frames are the same up to the order of sums.
         """
         if self._can_record and _recordable(source, settings):
             with self._lock:

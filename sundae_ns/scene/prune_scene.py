@@ -1,8 +1,7 @@
 """Pruning of a scene by what cameras see of it, without photographs, also to a size.
 
-What a file of a size holds is a trade: more Gaussians, or more bits for each. So a few :class:`Form` are tried, each
-with as many Gaussians as fit by samples, and the one whose images are nearest to those of the full scene is taken.
-Contributions and the graph are computed once. What is taken is then fitted, and rounded or counted to the size.
+A file of a size holds more Gaussians, or more bits for each. Of a few :class:`Form`, each with as many Gaussians as fit
+by samples, the one whose images are nearest to the full scene's is taken, fitted, and rounded or counted to the size.
 """
 
 from __future__ import annotations
@@ -172,9 +171,9 @@ def refit(
 ) -> Gaussians:
     """Fit centres, shapes, opacities and base colours of Gaussians to the images of more Gaussians, ``full``.
 
-    A merge keeps moments, not images. Adam's steps (Kingma and Ba, 2015) lower the squared error of the blended colours
-    and of the accumulation, over a few images each, in an order by ``seed``. Returns ``small`` if it matches no worse.
-    ``images`` ``[H, W, 4]`` of ``full`` for all cameras are not rendered again.
+    A merge keeps moments, not images. Adam's steps (Kingma and Ba, 2015) lower the squared error of blended colours and
+    accumulation, over a few images each, in an order by ``seed``; ``images`` ``[H, W, 4]`` are those of ``full``.
+    Returns ``small`` if it matches no worse.
     """
     steps, views, factor = by_device(REFIT, small["means"].device)
     cameras = [at_most(camera, REFIT_PIXELS) for camera in cameras]

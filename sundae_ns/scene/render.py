@@ -152,10 +152,9 @@ def render_view(
 def may_be_seen(means: Tensor, largest: Tensor, viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> Tensor:
     """Conservative visibility: True for all Gaussians that a backend renders, and some others; bool ``[R, N]``.
 
-    With the largest scale s, the depth z and the slope k of a pixel, clamped to the image and a margin, the Jacobian of
-    the perspective map has rows of length ``f / z * sqrt(1 + k^2)``. So a radius is at most ``3 s C / z`` with one C
-    per camera, plus the blur. Takes centres ``[N, 3]`` and largest standard deviations ``[N]``, world-to-camera
-    transforms ``[R, 4, 4]``, and intrinsics ``[R, 3, 3]`` and sizes ``[R, 2]`` in pixels.
+    With the largest scale s, depth z and slope k of a pixel, clamped to the image and a margin, the perspective map's
+    Jacobian has rows of length ``f / z * sqrt(1 + k^2)``: a radius is at most ``3 s C / z`` with one C a camera, plus
+    the blur. Takes centres ``[N, 3]``, largest deviations ``[N]``, viewmats, intrinsics and sizes ``[R, 2]``, pixels.
     """
     off_axis = Ks[:, :2, 2] - sizes / 2
     limit = off_axis.abs() + (0.5 + 0.5 * FOV_MARGIN) * sizes
@@ -183,10 +182,9 @@ def contribution(
 ) -> Tensor:
     """Blending weight of each Gaussian over a fixed background, summed over the pixels of all views ``[N]``.
 
-    Cameras come with a mask of the pixels that count, bool ``[H, W, 1]``, or None. With ``count``, the number of
-    Gaussians that a prune will keep, pixels are weighted by the detail that these cannot show (:func:`.pixel_detail`),
-    and blended colours and accumulation of each view, float16 ``[H, W, 4]``, are appended to ``images``. ``DataError``
-    if a mask has another size than its view.
+    Cameras come with a mask of the pixels that count, bool ``[H, W, 1]`` (else ``DataError``), or None. With ``count``,
+    the number of Gaussians that a prune will keep, :func:`.pixel_detail` that these cannot show weighs the pixels, and
+    blended colours and accumulation of each view, float16 ``[H, W, 4]``, are appended to ``images``.
     """
     from rich.progress import track  # takes 20 ms, which a render without a prune need not spend
 

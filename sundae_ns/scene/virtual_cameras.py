@@ -33,6 +33,8 @@ RESAMPLED = 3  # rounds that begin by drawing the even half anew, in proportion 
 EVENNESS = 4.0  # weight of the deviation of the angles beside their mean, for the half that sees all parts alike
 _PROBE_SIZE, _PROBES = 24, 64  # sides of the images that candidates are judged by, pixels, and images at once
 _PROBE_GAUSSIANS = 20_000  # most Gaussians of these images
+# Of front views: azimuths and elevations, radians, and distances.
+_AROUND = [math.tau * i / 24 for i in range(24)], [0.0, 0.2, 0.45], [0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0]
 
 
 def by_device(values: Mapping[str, T], device: torch.device) -> T:
@@ -43,10 +45,9 @@ def by_device(values: Mapping[str, T], device: torch.device) -> T:
 def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: int | None = None) -> list[Camera]:
     """Cameras that see a scene as a visitor would, for scenes without cameras.
 
-    Gaussians show where the photographs were taken: training splits them until each covers few pixels, so from there
-    all look small. Eyes around the middle look at random Gaussians; small images judge them by the logarithm of the
-    angle of the Gaussians that they show. Half of the cameras are the best of some draws and moves by its mean, the
-    others by mean and deviation; these look at random Gaussians in the end, to see what is around them.
+    Training splits Gaussians until each covers few pixels of the photographs, so from their places all look small.
+    Half of the cameras are the best of some draws and moves by the mean logarithm of the angle of the Gaussians in
+    small images; the others by mean and deviation, and look at random Gaussians in the end.
 
     Args:
         scene: its finite Gaussians count.
@@ -76,9 +77,9 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
         drawn = torch.randint(gaussians.num_gaussians, (count,), generator=generator)
         return (gaussians["means"][drawn.to(scene.device)].cpu().double() - middle) / reach
 
-    def climb(n: int, evenness: float) -> tuple[Tensor, Tensor]:  # eyes and targets of n cameras
+    def climb(n: int, moments: int) -> tuple[Tensor, Tensor]:  # eyes and targets of n cameras
         def best_of(eyes: Tensor, targets: Tensor) -> tuple[Tensor, Tensor, Tensor]:  # those n apart, and coarseness
-            coarseness = _coarseness(judge, sizes, eyes, targets, evenness).view(-1, n)
+            coarseness = _coarseness(judge, sizes, eyes, targets, moments).view(-1, n)
             best = coarseness.argmin(dim=0) * n + torch.arange(n)
             return eyes[best], targets[best], coarseness.amin(dim=0)
 
@@ -87,7 +88,7 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
         eyes = direction * NEAREST * (FARTHEST / NEAREST) ** share
         eyes, targets, coarseness = best_of(eyes, random_targets(FIRST * n))
         for done in range(ROUNDS):
-            if evenness and done < RESAMPLED:
+            if moments == 2 and done < RESAMPLED:
                 # Systematic draws.
                 chances = (-coarseness.double()).softmax(dim=0)
                 points = torch.arange(n, dtype=torch.float64) + torch.rand(1, generator=generator, dtype=torch.float64)
@@ -102,9 +103,9 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
             coarseness = torch.where(better, moved_coarseness, coarseness)
         return eyes, targets
 
-    eyes, targets = climb(n - n // 2, 0.0)
+    eyes, targets = climb(n - n // 2, 1)
     if n > 1:
-        even, _ = climb(n // 2, EVENNESS)
+        even, _ = climb(n // 2, 2)
         # In turns, so that the first few are of both kinds.
         turns = torch.cat([torch.arange(len(eyes)) * 2, torch.arange(len(even)) * 2 + 1]).argsort()
         eyes = torch.cat([eyes, even])[turns]
@@ -116,22 +117,22 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
     ]
 
 
-def front_views(scene: Scene, n: int = 8) -> list[Camera]:
-    """Cameras of 640 x 480 pixels that look at the middle of a scene, the best first, for a page or a film of it.
+def front_views(scene: Scene, n: int = 7) -> list[Camera]:
+    """Up to 7 cameras of 640 x 480 pixels that look at the middle of a scene, from one side and up to 45 degrees off.
 
-    They have the eyes of virtual cameras that see the smallest and most equal Gaussians; steep ones come last.
+    The first sees most of the scene, by the smallest and most equal Gaussians; a page opens with it.
     """
     gaussians = usable(scene)
     middle, reach = middle_and_reach(gaussians)
     probe, sizes = _probe(gaussians, middle, reach, torch.Generator().manual_seed(0))
-    eyes = torch.stack([camera.center.double() for camera in virtual_cameras(scene, 48)]) - middle
-    up = scene.up or (0.0, 0.0, 1.0)
-    ahead, judge = torch.nn.functional.normalize(eyes, dim=1), dataclasses.replace(scene, gaussians=probe)
-    costs = _coarseness(judge, sizes, eyes / reach, torch.zeros_like(eyes), EVENNESS)
-    costs += 1e3 * ((ahead @ eyes.new_tensor(up)).abs() > 0.6)
-    costs += 1e3 * (ahead @ ahead[costs.argmin()] < 0.3)  # a film from both sides would cross the scene
-    best = eyes[costs.argsort()[:n]]
-    return [Camera.look_at(middle + eye, middle, up, fov=50, width=640, height=480) for eye in best]
+    up = torch.tensor(scene.up or (0.0, 0.0, 1.0), dtype=torch.float64)
+    turn, rise, away = torch.cartesian_prod(*(up.new_tensor(values) for values in _AROUND)).T
+    around = torch.stack([turn.cos() * rise.cos(), turn.sin() * rise.cos(), rise.sin()]) * away
+    eyes = (poses_looking_at(up, torch.zeros_like(up), up)[:, :3] @ around).T
+    judge = dataclasses.replace(scene, gaussians=probe)
+    best, each = int(_coarseness(judge, sizes, eyes, torch.zeros_like(eyes), 3).argmin()), len(eyes) // len(_AROUND[0])
+    places = [middle + reach * eyes[(best + side * each) % len(eyes)] for side in (0, 1, -1, 2, -2, 3, -3)]
+    return [Camera.look_at(eye, middle, up, fov=50, width=640, height=480) for eye in places[:n]]
 
 
 def of_unit_size(scene: Scene, cameras: Sequence[Camera]) -> tuple[Scene, list[Camera], float]:
@@ -170,8 +171,6 @@ def split(cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:
 
 def resized(gaussians: Gaussians, factor: float) -> Gaussians:
     """The Gaussians, ``factor`` times as large."""
-    if factor == 1:
-        return gaussians
     return gaussians.replaced({"means": gaussians["means"] * factor, "scales": gaussians["scales"] + math.log(factor)})
 
 
@@ -206,8 +205,11 @@ def _factor(values: Tensor, count: int) -> Tensor:
 
 
 @torch.no_grad()
-def _coarseness(scene: Scene, sizes: Tensor, eyes: Tensor, targets: Tensor, evenness: float) -> Tensor:
-    """Mean logarithm of the angle of the Gaussians in the pixels, and ``evenness`` times its deviation ``[V]``."""
+def _coarseness(scene: Scene, sizes: Tensor, eyes: Tensor, targets: Tensor, moments: int) -> Tensor:
+    """Mean logarithm of the angle of the Gaussians in the pixels ``[V]``, of 2 moments with its deviation.
+
+    With 3 only covered pixels count, and a view gains by their number, as by more Gaussians, and by centres in it.
+    """
     means, settings = scene.gaussians["means"], scene.settings(head=False)
     coarseness: list[Tensor] = []
     poses = poses_looking_at(eyes, targets, eyes.new_tensor([0.0, 0.0, 1.0]))
@@ -218,11 +220,18 @@ def _coarseness(scene: Scene, sizes: Tensor, eyes: Tensor, targets: Tensor, even
         distances = (means - eyes[some, None]).norm(dim=2).clamp_min(1e-9)
         angles = (sizes - distances.log()).clamp_max(0)
         # Blending adds nothing where nothing is seen: the logarithm of one radian.
-        powers = torch.stack([angles, angles.square()][: 2 if evenness else 1], dim=-1)
+        powers = torch.stack([angles, angles.square(), torch.ones_like(angles)][:moments], dim=-1)
         probes = dataclasses.replace(inputs, colors=powers)
         images = rasterize_cameras(probes, viewmats[some], camera.K.expand(len(powers), 3, 3), backend=settings.backend)
-        mean, *squares = images.mean(dim=(1, 2)).unbind(dim=1)
-        for square in squares:
-            mean = mean + evenness * (square - mean.square()).clamp_min(0).sqrt()
+        mean, *others = images.mean(dim=(1, 2)).unbind(dim=1)
+        if moments == 3:
+            covered = others.pop().clamp_min(1e-6)
+            mean, others = mean / covered, [others[0] / covered]
+        for square in others:
+            mean = mean + EVENNESS * (square - mean.square()).clamp_min(0).sqrt()
+        if moments == 3:
+            x, y, z = (viewmats[some, :3, :3] @ means.T + viewmats[some, :3, 3:]).unbind(dim=1)
+            inside = torch.maximum(x.abs(), y.abs()) < z * math.tan(math.radians(FOV / 2))
+            mean = mean - (covered.log() + inside.float().mean(dim=1)) / 2
         coarseness.append(mean)
     return torch.cat(coarseness).cpu()  # the one wait for a GPU
