@@ -82,7 +82,9 @@ def plot_curve() -> Any:
 
 def plot_error() -> Any:
     """Quality against time and size, in decibels over stock, and the error of the graph's response against time."""
-    marks = [(0, row["scene"], row["arm"], row["train_s"], row["psnr"]) for row in lines_of("training_time.jsonl")]
+    runs = lines_of("training_time.jsonl")
+    marks = [(0, row["scene"], row["arm"], row["train_s"], row["psnr"]) for row in runs]
+    marks += [(2, row["scene"], row["arm"], row["ms_frame"], row["psnr"]) for row in runs if "ms_frame" in row]
     for capture, files in stock_in(dict).items():
         for kind, method in ((".sundae", "splatfacto"), (".sog theirs", "splatfacto, .sog")):
             if kind in files:
@@ -90,9 +92,6 @@ def plot_error() -> Any:
     for capture, rows in defaults().items():
         for kind, method in (("packed", "sundae"), ("tuned", "sundae, fine-tuned")):
             marks.append((1, capture, method, mean(rows, f"{kind}_bytes") / MB, mean(rows, f"{kind}_psnr")))
-    for row in lines_of("frames.jsonl"):
-        capture, method, *_ = row["config"].split(", ")
-        marks.append((2, capture, method, row["ms_frame"], row["psnr"]))
     stock = {(number, capture): psnr for number, capture, method, _, psnr in marks if method == "splatfacto"}
     figure, ((seconds, sizes), (frames, graph)) = plt.subplots(2, 2, figsize=(10, 7.5), layout="constrained")
     panels = (seconds, sizes, frames)

@@ -61,7 +61,7 @@ def runs() -> dict[tuple[str, str], list[dict[str, Any]]]:
 
 
 def quality() -> list[str]:
-    """All methods on the captures: quality and size; :func:`speed` has times, because suites share their GPUs."""
+    """All methods on the captures: quality and size; :func:`training_time` has times, because suites share their GPUs."""
     cells = {}
     for (scene, method), rows in runs().items():
         errors = ", ".join(spread([float(row[name]) for row in rows], n) for name, n in (("psnr", 2), ("ssim", 4)))
@@ -81,27 +81,20 @@ def side_by_side(cells: dict[tuple[str, str], str], head: str = "capture") -> li
     return table([head, *methods], rows, words=1)
 
 
-def speed() -> list[str]:
-    """Milliseconds of frames, each with the error of the same frames."""
-    cells = {}
-    for line in lines_of("frames.jsonl"):
-        capture, method = line["config"].split(", ", 1)
-        parts = f" (splat {line['ms_splat']:.2f}, head {line['ms_head']:.2f})" if line["ms_head"] else ""
-        quality = f"{number(line['primitives'], 0)}; {line['psnr']:.2f}, {line['ssim']:.4f}"
-        size = f"{line['width']} x {line['height']}"
-        cells[f"{capture}, {size}", method] = f"{line['ms_frame']:.2f} ms{parts}<br>{quality}"
-    return side_by_side(cells)
-
-
 def training_time() -> list[str]:
-    """Seconds of whole trainings, each with the error of what was trained."""
+    """Seconds of whole trainings and milliseconds of frames, each with the error of what was trained."""
     cells = {}
     for line in lines_of("training_time.jsonl"):
-        step = f"{1000 * line['train_s'] / line['steps']:.2f} ms a step"
+        frame = f", {line['ms_frame']:.2f} a frame" if "ms_frame" in line else ""
+        step = f"{1000 * line['train_s'] / line['steps']:.2f} ms a step{frame}"
         quality = ", ".join(number(line[name], digits) for name, digits in (("psnr", 2), ("ssim", 4)))
-        arm = f"{line['arm']}, {number(line['steps'], 0)} steps"
+        arm = f"{line['arm']}, {number(line['steps'], 0)} steps, {gpu(line['gpu'])}"
         cells[line["scene"], arm] = f"{line['train_s']:.0f} s, {step}<br>{number(line['primitives'], 0)}; {quality}"
     return side_by_side(cells)
+
+
+def gpu(name: str) -> str:
+    return name.removeprefix("NVIDIA ").removesuffix(" 80GB HBM3")
 
 
 def packing() -> list[str]:
@@ -109,7 +102,8 @@ def packing() -> list[str]:
     stock, made = runs(), []
     for capture, rows in defaults().items():
         count, head = mean(rows, "primitives"), "yes" if rows[0]["head"] == "yes" else ""
-        cells = [capture, _quality(stock[capture, "splatfacto"], ""), number(count, 0), head, _quality(rows, "")]
+        theirs = _quality(stock[capture, "splatfacto"], "") if (capture, "splatfacto") in stock else ""
+        cells = [capture, theirs, number(count, 0), head, _quality(rows, "")]
         packed, tuned = (mean(rows, f"{kind}_bytes") for kind in ("packed", "tuned"))
         cells += [number(packed / MB, 1), _quality(rows, "packed_")]
         cells += [number(tuned / MB, 2), number(8 * tuned / count, 0), _quality(rows, "tuned_")]
@@ -213,7 +207,7 @@ def multi_gpu() -> list[str]:
     for line in sorted(lines_of("multi_gpu.jsonl"), key=lambda line: (line["variant"], line["ranks"])):
         field = f"{line['scene']}, tiled"
         psnr = list(line["psnr_after_images"].values())[-1]
-        cells = [f"{line['ranks']} {line['gpu'].removesuffix(' 80GB HBM3').split()[-1]}"]
+        cells = [f"{line['ranks']} {gpu(line['gpu'])}"]
         figures = ((line["primitives"], 0), (line["images_per_s"], 1), (psnr, 2), (max(line["peak_mib"]), 0))
         rows.append([field if field != above else "", *cells, *(number(*figure) for figure in figures)])
         above = field
@@ -323,7 +317,7 @@ def _first(value: Any) -> str:
     return re.sub("`[^`]*`", lambda code: code[0].replace(" ", GLUE), sentence)  # a line must not begin with * or +
 
 
-MAKERS = (quality, speed, training_time, packing, formats, packed_headline, equal_quality, multi_gpu, prune)
+MAKERS = (quality, training_time, packing, formats, packed_headline, equal_quality, multi_gpu, prune)
 TABLES: dict[str, Callable[[], list[str]]] = {
     make.__name__.replace("_", "-"): make for make in (*MAKERS, sizes_asked, others, stability, library)
 }
