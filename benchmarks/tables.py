@@ -61,7 +61,7 @@ def runs() -> dict[tuple[str, str], list[dict[str, Any]]]:
 
 
 def quality() -> list[str]:
-    """All methods on the captures: quality and size; :func:`training_time` has times, because suites share their GPUs."""
+    """All methods on the captures: quality and size; :func:`training_time` has times, because suites share GPUs."""
     cells = {}
     for (scene, method), rows in runs().items():
         errors = ", ".join(spread([float(row[name]) for row in rows], n) for name, n in (("psnr", 2), ("ssim", 4)))
