@@ -27,7 +27,8 @@ def afford_gaussians(count: int, coefficients: int, size: int) -> None:
 
 def read_exactly(stream: IO[bytes] | BufferedIOBase, size: int) -> bytes:
     """The next ``size`` bytes of a stream that decompresses; ``ValueError`` if it ends before."""
-    if len(content := stream.read(size)) < size:
+    content = stream.read(size)
+    if len(content) < size:
         raise ValueError(f"{size - len(content):,} bytes are missing")
     return content
 
@@ -36,6 +37,7 @@ def parsed_json(content: bytes) -> Any:
     """A JSON object of a file; ``ValueError`` for other values, and for more than 8 MiB, which take 200."""
     if len(content) > _MOST_JSON:
         raise ValueError(f"its JSON has {len(content):,} bytes, and may have {_MOST_JSON:,}")
-    if not isinstance(value := json.loads(content), dict):
+    value = json.loads(content)
+    if not isinstance(value, dict):
         raise ValueError("its JSON is no object")
     return value

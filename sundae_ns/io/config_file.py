@@ -153,7 +153,8 @@ def _value(path: Path, *keys: str) -> Any:
 
 def model_options(path: Path) -> dict[str, Any]:
     """Options of the model in a run's ``config.yml``; ``CheckpointError`` if it is no configuration of a run."""
-    if not isinstance(options := _value(path, "pipeline", "model"), dict):
+    options = _value(path, "pipeline", "model")
+    if not isinstance(options, dict):
         raise CheckpointError(f"{path} is not a run's config.yml; give the folder of a run")
     return options
 
@@ -173,7 +174,8 @@ def capture_and_source(path: Path) -> tuple[Path | None, Path | None]:
 
 def schedule_length(path: Path) -> int:
     """Number of steps of a run's schedule; ``CheckpointError`` if it is no configuration of a run of ours."""
-    if not isinstance(length := _value(path, "schedule_length"), int):
+    length = _value(path, "schedule_length")
+    if not isinstance(length, int):
         raise CheckpointError(f"{path} states no length of its schedule; give a run of sundae")
     return length
 

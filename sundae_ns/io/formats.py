@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -21,6 +21,7 @@ from sundae_ns.io.splat import read_gsplat, read_ksplat, read_splat
 from sundae_ns.io.spz import read_spz, write_spz
 
 Kind = Literal["packed", "ply", "spz", "sog", "glb", "splat", "ksplat", "gsplat"]
+Reader = Callable[[Path], tuple[dict[str, Tensor], Marks]]
 FORMATS = (".ply", ".spz", ".sog", ".glb")  # that write_for_viewers writes
 _BY_SUFFIX: dict[str, Kind] = {".ply": "ply", ".spz": "spz", ".sog": "sog", ".glb": "glb"}
 _BY_SUFFIX |= {".splat": "splat", ".ksplat": "ksplat", ".pt": "gsplat"}
@@ -38,7 +39,7 @@ _UNREAD = {
     ".pth": "is a checkpoint of another trainer; give its .ply, such as point_cloud/iteration_*/point_cloud.ply",
     **dict.fromkeys(".rar .7z .tar .tgz .xz .zst".split(), "is an archive; unpack it, and give the scene in it"),
 }
-_READERS: dict[Kind | None, Callable[[Path], Any]] = {"spz": read_spz, "sog": read_sog, "glb": read_glb}
+_READERS: dict[Kind | None, Reader] = {"spz": read_spz, "sog": read_sog, "glb": read_glb}
 _READERS |= {"splat": read_splat, "ksplat": read_ksplat, "gsplat": read_gsplat}
 _WRITERS: dict[str, Callable[..., None]] = {".spz": write_spz, ".sog": write_sog, ".glb": write_glb}
 _WRITERS[".ply"] = lambda path, gaussians, marks: write_ply(path, gaussians, comments=comments_of(marks))
@@ -105,8 +106,7 @@ def read_gaussian_file(path: Path) -> tuple[Sanitised, Marks]:
     damaged, of another kind, or has no finite Gaussian.
     """
     kind = kind_of_gaussians(path)
-    read = _READERS[kind](path) if kind in _READERS else (read_ply(path), ply_marks(path))
-    params, marks = read if isinstance(read, tuple) else (read, Marks())
+    params, marks = _READERS[kind](path) if kind in _READERS else (read_ply(path), ply_marks(path))
     params["means"], offset = recentred(params["means"])
     if offset is not None:
         _log.warning("%s lies where float32 is too coarse; its coordinates are less %.10g %.10g %.10g", path, *offset)

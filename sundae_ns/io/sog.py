@@ -327,16 +327,13 @@ def codebook(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[
     quantiles = np.quantile(ordered, (np.arange(128) + 0.5) / 128)
     centres = np.sort(np.concatenate([quantiles, np.linspace(ordered[0], ordered[-1], 128)]))
     for _ in range(30):
-        bounds = np.concatenate([[0], np.searchsorted(ordered, _middles(centres)), [len(ordered)]])
+        bounds = np.concatenate([[0], np.searchsorted(ordered, (centres[1:] + centres[:-1]) / 2), [len(ordered)]])
         number = np.diff(bounds)
         # Sort again: rounding of the sums may swap neighbouring means.
         centres = np.sort(np.where(number > 0, np.diff(sums[bounds]) / np.maximum(number, 1), centres))
     numbers = centres.astype(np.float32)
-    return numbers, np.searchsorted(_middles(numbers.astype(np.float64)), values).astype(np.uint8)
-
-
-def _middles(centres: NDArray[np.float64]) -> NDArray[np.float64]:
-    return (centres[1:] + centres[:-1]) / 2
+    stored = numbers.astype(np.float64)
+    return numbers, np.searchsorted((stored[1:] + stored[:-1]) / 2, values).astype(np.uint8)
 
 
 def palette(rows: NDArray[np.float32], max_rows: int = MAX_PALETTE) -> tuple[NDArray[np.float32], NDArray[np.int64]]:

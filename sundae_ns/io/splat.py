@@ -34,7 +34,7 @@ from torch import Tensor
 from sundae_ns.core.errors import reading, regular
 from sundae_ns.core.gaussians import SPLAT_NAMES, rgb_to_sh
 from sundae_ns.io.checkpoint import check_whole, load_tensors
-from sundae_ns.io.ply import LEAST_OPACITY, check_gaussians
+from sundae_ns.io.ply import LEAST_OPACITY, UNMARKED, Marks, check_gaussians
 
 _SPLAT = np.dtype([("means", "<f4", 3), ("widths", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 _HEADER, _HEADER_BYTES = struct.Struct("<BBxxIIIIHxx12x2f"), 4096
@@ -63,11 +63,11 @@ def joined(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:
     return {name: torch.cat([part[name] for part in parts]) for name in SPLAT_NAMES}
 
 
-def read_splat(path: Path) -> dict[str, Tensor]:
+def read_splat(path: Path) -> tuple[dict[str, Tensor], Marks]:
     """Read a .splat, which has no view-dependent colours; ``DataError`` if it has no whole number of Gaussians.
 
-    The result has the names of :data:`sundae_ns.core.gaussians.SPLAT_NAMES`, float32 on the CPU, in the file's
-    coordinates. Log-scales of widths of 0 are infinite; see ``gaussians.sanitise``.
+    Gaussians have the names of :data:`sundae_ns.core.gaussians.SPLAT_NAMES`, float32 on the CPU, in the file's
+    coordinates; such files state nothing of them. Log-scales of widths of 0 are infinite; see ``gaussians.sanitise``.
     """
     with reading(path, "a complete .splat"):
         content = regular(path).read_bytes()
@@ -75,10 +75,11 @@ def read_splat(path: Path) -> dict[str, Tensor]:
         begin = content[: 1 << 16]
         if (begin and begin.decode(errors="ignore").encode() == begin) or (rows["widths"] < 0).any():
             raise ValueError("it is text, or has negative widths")
-    return _gaussians(rows, rows["means"], (rows["quats"].astype(np.float32) - 128) / 128, np.zeros((len(rows), 0, 3)))
+    quats = (rows["quats"].astype(np.float32) - 128) / 128
+    return _gaussians(rows, rows["means"], quats, np.zeros((len(rows), 0, 3))), UNMARKED
 
 
-def read_ksplat(path: Path) -> dict[str, Tensor]:
+def read_ksplat(path: Path) -> tuple[dict[str, Tensor], Marks]:
     """As :func:`read_splat`, a .ksplat of any level; ``DataError`` for other versions, or sections of other degrees."""
     with reading(path, "a complete .ksplat", remedy="export it again, or convert it to .ply with splat-transform"):
         data = memoryview(regular(path).read_bytes())
@@ -91,7 +92,7 @@ def read_ksplat(path: Path) -> dict[str, Tensor]:
             section = _SECTION.unpack_from(data, _HEADER_BYTES + i * _SECTION_BYTES)
             part, start = _section(data, start, level, (low or -1.5, high or 1.5), section)
             parts.append(part)
-        return joined(parts)
+        return joined(parts), UNMARKED
 
 
 def _section(
@@ -133,7 +134,7 @@ def rank_files(path: Path) -> list[Path]:
     return sorted(file for file in path.parent.glob("*.pt") if name.fullmatch(file.stem)) or [path]
 
 
-def read_gsplat(path: Path) -> dict[str, Tensor]:
+def read_gsplat(path: Path) -> tuple[dict[str, Tensor], Marks]:
     """As :func:`read_splat`, a checkpoint of gsplat's trainer, of all its ranks. No code in it runs."""
     parts = []
     for each in rank_files(path):
@@ -141,7 +142,7 @@ def read_gsplat(path: Path) -> dict[str, Tensor]:
             check_whole(file)
             parts.append(_trained(load_tensors(file)))
     with reading(path, "a checkpoint of gsplat", remedy="give another file"):
-        return joined(parts)
+        return joined(parts), UNMARKED
 
 
 def _trained(loaded: Any) -> dict[str, Tensor]:

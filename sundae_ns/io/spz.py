@@ -87,7 +87,8 @@ def write_spz(path: Path, params: Mapping[str, Tensor], marks: Marks = UNMARKED)
 def read_spz(path: Path) -> tuple[dict[str, Tensor], Marks]:
     """Read a .spz of version 1 to 4: Gaussians as of ``ply.read_ply``, and what it states of them."""
     with reading(path, "a complete .spz"):
-        params, marks = decoded(content := regular(path).read_bytes(), "RDF")
+        content = regular(path).read_bytes()
+        params, marks = decoded(content, "RDF")
         comment = content[10 : content.find(b"\0", 10, 1024)] if content.startswith(_COMMENTED) else b""
         return params, marks_in(comment.decode("latin-1").splitlines())._replace(antialiased=marks.antialiased)
 

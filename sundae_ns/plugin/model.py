@@ -443,8 +443,6 @@ class NerfstudioRun:
         """Write numbers to the run's event file."""
         writer.put_dict(name=name, scalar_dict=dict(values), step=self.state.step)
 
-    # -------------------------------------------------------------------------------------------------------- callbacks
-
     def start(self) -> list[TrainingCallback]:
         """nerfstudio's callbacks, after ours have checked the run with the optimizers and records that they need."""
         assert self._optimizers is not None

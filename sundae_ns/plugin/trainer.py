@@ -76,7 +76,8 @@ class SundaeTrainerConfig(TrainerConfig):
         if datamanager.data is None:  # an unset path is nerfstudio's example
             owners.append((datamanager.dataparser, "data"))
         for owner, name in owners:
-            if isinstance(value := getattr(owner, name, None), Path):
+            value = getattr(owner, name, None)
+            if isinstance(value, Path):
                 setattr(owner, name, value.absolute())
 
     def get_base_dir(self) -> Path:

@@ -64,7 +64,8 @@ def rasterize_cameras(inputs: Inputs, viewmats: Tensor, Ks: Tensor, *, backend: 
 
 def two_at_once(function: Callable[[Any], T], views: Iterable[Any]) -> Iterator[T]:
     """As ``map``, for views on a CPU: two at a time, each on half of the threads."""
-    torch.set_num_threads(threads := torch.get_num_threads())  # two threads cannot make the pool of a forked process
+    threads = torch.get_num_threads()
+    torch.set_num_threads(threads)  # two threads cannot make the pool of a forked process
     try:
         with ThreadPoolExecutor(2, initializer=torch.set_num_threads, initargs=(max(1, threads // 2),)) as pool:
             yield from pool.map(function, views)
@@ -127,8 +128,8 @@ def blending_weights(inputs: Inputs, pixels: Tensor | None = None, *, backend: B
 
 def _check(inputs: Inputs) -> None:
     camera, colors, n = inputs.camera, inputs.colors, len(inputs.means)
-    if min(size := (camera.width, camera.height)) < 1:
-        raise DataError(f"an image of {size[0]}x{size[1]} pixels is empty; width and height must be at least 1")
+    if min(camera.width, camera.height) < 1:
+        raise DataError(f"an image of {camera.width}x{camera.height} pixels is empty; both sides must be at least 1")
     shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "viewmat": (4, 4), "K": (3, 3)}
     tensors = {name: getattr(inputs if hasattr(inputs, name) else camera, name) for name in shapes}
     _check_shapes(*((value, name, shapes[name]) for name, value in tensors.items()))

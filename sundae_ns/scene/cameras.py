@@ -26,6 +26,7 @@ from sundae_ns.scene.virtual_cameras import FOV, front_views
 
 MOST_FRAMES = 36_000  # of a film: 25 minutes
 MOST_CAMERAS = 10_000  # of a file
+_STOPS = 8  # of a film; all orders of more take long
 _STEEP = 0.95  # largest sine of a camera's pitch; steeper ones have no upright image
 Array = NDArray[np.float64]
 Pinhole = tuple[np.ndarray, Sequence[float], int, int]  # OpenGL camera-to-world [3 or 4, 4], fx fy cx cy, width, height
@@ -180,13 +181,13 @@ def film_views(scene: Scene, *, seconds: float = 12.0, frames_per_second: float 
     return [lens._replace(viewmat=viewmat) for viewmat in world_to_camera(moved.float())]
 
 
-def _tour(points: Array, most: int = 8) -> Array:
-    """The first of points ``[N, C]`` and at most ``most - 1`` typical others, in the order of the shortest way back."""
+def _tour(points: Array) -> Array:
+    """At most eight points of ``[N, C]``, the first and typical others, in the order of the shortest way back."""
     chosen = list(range(len(points)))
-    if len(points) > most:
+    if len(points) > _STOPS:
         from scipy.cluster.vq import kmeans2  # takes long, and a file of cameras needs none
 
-        centers, _ = kmeans2(points, most, minit="++", rng=np.random.default_rng(0))
+        centers, _ = kmeans2(points, _STOPS, minit="++", rng=np.random.default_rng(0))
         centers = np.delete(centers, np.linalg.norm(centers - points[0], axis=1).argmin(), axis=0)
         chosen = [0, *(int(np.linalg.norm(points - center, axis=1).argmin()) for center in centers)]
     keys = points[sorted(set(chosen))]

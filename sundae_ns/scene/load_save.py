@@ -122,7 +122,8 @@ def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -
     """The scene of a checkpoint with the contents ``loaded``, on the CPU; ``CheckpointError`` if they do not fit."""
     options = model_options(config)
     gaussians, state = checkpoint.gaussians_of(loaded, source), checkpoint.model_state(loaded)
-    extra = entries if isinstance(entries := state.get(checkpoint.EXTRA_STATE), Mapping) else {}
+    entries = state.get(checkpoint.EXTRA_STATE)
+    extra = entries if isinstance(entries, Mapping) else {}
     focal = extra.get("trained_focal")
     head = _head_of(state, options, source) if extra.get("head_enabled") else None
     if head is not None:
@@ -132,7 +133,6 @@ def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -
         degree = int(loaded["step"]) // max(interval, 1)  # training did not reach higher ones
         gaussians["features_rest"] = gaussians["features_rest"][:, : (degree + 1) ** 2 - 1]
     gaussians = formats.usable(gaussians, source).gaussians
-    upright = orientation_of(config) in ("up", "vertical")  # by default z is up
     frame = None
     with suppress(DataError, KeyError, TypeError, ValueError):
         stated = read_json(config.parent / FRAME_FILE)
@@ -143,7 +143,7 @@ def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -
         background_color=options.get("background_color", "random"),
         antialiased=options.get("rasterize_mode") == "antialiased",
         trained_focal=(float(focal[0]), float(focal[1])) if head is not None and focal else None,
-        up=(0.0, 0.0, 1.0) if upright else None,
+        up=(0.0, 0.0, 1.0) if orientation_of(config) in ("up", "vertical") else None,
         in_model_frame=True,
         meta={"source": {"step": int(loaded["step"])}, **({"frame": frame} if is_frame(frame) else {})},
     )

@@ -89,7 +89,6 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
         eyes, targets, coarseness = best_of(eyes, random_targets(FIRST * n))
         for done in range(ROUNDS):
             if moments == 2 and done < RESAMPLED:
-                # Systematic draws.
                 chances = (-coarseness.double()).softmax(dim=0)
                 points = torch.arange(n, dtype=torch.float64) + torch.rand(1, generator=generator, dtype=torch.float64)
                 drawn = torch.searchsorted(chances.cumsum(0), points / n).clamp_max(n - 1)

@@ -169,7 +169,7 @@ def test_values_of_a_ksplat_are_those_of_the_ply(level, degree):
     # Half a step of 16 bits in half a unit. All else is rounded down, by a whole step.
     tolerances = {"features_dc": 0.014, "opacities": 1 / 255 + 1e-6, "features_rest": (0, HALF / 2, 2 / 255)[level]}
     tolerances |= {"means": 4e-6, "scales": 1.001 * HALF, "quats": HALF} if level else {"scales": 1e-6, "quats": 1e-6}
-    assert_close(read_ksplat(ksplat(level, degree)), truth, tolerances)
+    assert_close(read_ksplat(ksplat(level, degree))[0], truth, tolerances)
 
 
 def changed(path, changes):
@@ -215,7 +215,7 @@ def test_unstated_bounds_of_a_ksplat_and_ranges_are_those_of_its_viewer(tmp_path
     struct.pack_into("<2f", data, 36, 0, 0)
     struct.pack_into("<I", data, SECTION + 24, 0)
     path.write_bytes(data)
-    before, after = read_ksplat(ksplat(2, 1)), read_ksplat(path)
+    before, after = read_ksplat(ksplat(2, 1))[0], read_ksplat(path)[0]
     low, high = struct.unpack_from("<2f", ksplat(2, 1).read_bytes(), 36)
     shares = (before["features_rest"] - low) / (high - low)
     torch.testing.assert_close(after["features_rest"], 3 * shares - 1.5, rtol=0, atol=1e-5)
@@ -224,6 +224,6 @@ def test_unstated_bounds_of_a_ksplat_and_ranges_are_those_of_its_viewer(tmp_path
 
 def test_only_used_gaussians_of_a_ksplat_are_read(tmp_path):
     """A file that was stored while it loaded has room for more."""
-    values = read_ksplat(changed(tmp_path / "a.ksplat", [(SECTION, "<I", 3)]))
-    whole = read_ksplat(ksplat(1, 2))
+    values = read_ksplat(changed(tmp_path / "a.ksplat", [(SECTION, "<I", 3)]))[0]
+    whole = read_ksplat(ksplat(1, 2))[0]
     assert all(torch.equal(values[name], torch.cat([whole[name][:3], whole[name][16:]])) for name in SPLAT_NAMES)

@@ -31,8 +31,14 @@ _UNIT = 127  # a basis is stored in these parts of a step
 _CHUNK, _PART = 1 << 16, 1 << 13  # rows expanded at once, and, as new memory takes a CPU long, transformed
 _LEAST_EIGENVALUE = 0.02  # of a form, relative to the mean: other cameras see more of these errors
 _LOGITS = (-6.0, 8.0)  # opacities outside look the same as at these: below 1/255 nothing is drawn
-_STEPS = {"quats": "rotation_step", "scales": "scale_step", "opacities": "opacity_step"}  # options, by attribute
-_STEPS |= {"features_dc": "color_step", "features_rest": "harmonics_step", FEATURES: "feature_step"}
+_STEPS = {  # options, by attribute
+    "quats": "rotation_step",
+    "scales": "scale_step",
+    "opacities": "opacity_step",
+    "features_dc": "color_step",
+    "features_rest": "harmonics_step",
+    FEATURES: "feature_step",
+}
 _LARGEST_SHARE = 0.5  # step of an output channel of the head, at most, relative to its largest weight
 _RUN = 16  # neighbours on the curve whose levels share a mean and a magnitude, in the estimate of bits
 
@@ -52,6 +58,12 @@ class Blocks(NamedTuple):
         """Cells ``[N, 3]`` of the blocks' grids."""
         return np.stack([separate(self.codes, axis) for axis in range(3)], axis=1)
 
+    def positions(self, bits: int, size: int) -> Floats:
+        """Positions ``[N, 3]`` of cells of ``bits`` a coordinate in blocks of this ``size``, in the blocks' order."""
+        block = np.arange(len(self.codes)) // size
+        step = (self.high.astype(np.float64) - self.low) / (2**bits - 1)
+        return (self.cells * step[block] + self.low[block]).astype(np.float32)
+
 
 def quantize_positions(means: Floats, bits: int, size: int) -> tuple[Blocks, NDArray[np.int64]]:
     """Round positions to a grid in each block, and sort each block by Morton code, so that differences are small.
@@ -69,13 +81,6 @@ def quantize_positions(means: Floats, bits: int, size: int) -> tuple[Blocks, NDA
     codes = interleave(cells)
     order = np.lexsort((codes, block))
     return Blocks(codes[order], low, high), order
-
-
-def dequantize_positions(packed: Blocks, bits: int, size: int) -> Floats:
-    """Positions ``[N, 3]`` of the result of :func:`quantize_positions`, in the order of the blocks."""
-    block = np.arange(len(packed.codes)) // size
-    step = (packed.high.astype(np.float64) - packed.low) / (2**bits - 1)
-    return (packed.cells * step[block] + packed.low[block]).astype(np.float32)
 
 
 def aligned(quats: Floats, scales: Floats) -> tuple[Floats, Floats]:
@@ -112,14 +117,14 @@ class Rotations:
 
     def rounded(self, values: Tensor) -> Tensor:
         """Return the unit quaternions that a reader decodes; bit for bit on a CPU."""
-        return rotations_at(self.coefficients(values).round(), self.step)
+        return quats_at(self.coefficients(values).round(), self.step)
 
     def coefficients(self, values: Tensor) -> Tensor:
         """Components x, y and z in steps, float64 ``[N, 3]``; gradients flow through them."""
         return _normalized(values.double())[:, 1:] / self.step
 
 
-def rotations_at(levels: Tensor, step: float) -> Tensor:
+def quats_at(levels: Tensor, step: float) -> Tensor:
     """Unit quaternions wxyz ``[N, 4]``, float32, of levels of x, y and z ``[N, 3]``; w is positive."""
     x, y, z = (levels.double() * step).float().T
     # Written out: a reduction could round differently for another number of rows.
@@ -393,7 +398,7 @@ def fit_codecs(
         config = replace(config, block=max(config.block // 4, 16))  # what lies far away makes its whole block coarse
     order = order[within]
     values = {name: value[order] for name, value in values.items()}
-    values["means"] = dequantize_positions(blocks, config.position_bits, config.block)
+    values["means"] = blocks.positions(config.position_bits, config.block)
     values["quats"], values["scales"] = aligned(values["quats"], values["scales"])
     values["opacities"] = values["opacities"].clip(*_LOGITS)
     forms = {} if sensitivity is None else sensitivity.rows

@@ -213,7 +213,8 @@ def encode(meta: Mapping[str, Any], arrays: Mapping[str, Array], *, unpacked: in
 
 def _front(meta: Mapping[str, Any]) -> bytes:
     """All bytes of a file before its sections."""
-    if len(header := json.dumps(meta, allow_nan=False, separators=(",", ":")).encode()) > MAX_HEADER:
+    header = json.dumps(meta, allow_nan=False, separators=(",", ":")).encode()
+    if len(header) > MAX_HEADER:
         raise PackError(f"the header takes {len(header):,} bytes, readers accept {MAX_HEADER:,}; give fewer cameras")
     return _PREAMBLE.pack(MAGIC, VERSION, len(header), hashlib.sha256(header).digest()) + header
 

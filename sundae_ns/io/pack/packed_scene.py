@@ -22,17 +22,7 @@ from sundae_ns.core.files import replacing
 from sundae_ns.core.gaussians import FEATURES, SPLAT_NAMES, finite_mask, num_gaussians
 from sundae_ns.io.budget import afford
 from sundae_ns.io.pack import container, entropy
-from sundae_ns.io.pack.codecs import (
-    Blocks,
-    Codecs,
-    Sensitivity,
-    as_matrix,
-    dequantize_positions,
-    fit_codecs,
-    rotations_at,
-    rows_at,
-    weights_at,
-)
+from sundae_ns.io.pack.codecs import Blocks, Codecs, Sensitivity, as_matrix, fit_codecs, quats_at, rows_at, weights_at
 from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.io.pack.container import FORMAT, MAX_RATIO, SPARE, Array, Coded, Levels, fault, fits, in_range
 from sundae_ns.io.ply import check_gaussians
@@ -72,7 +62,8 @@ class PackReport(NamedTuple):
     def summary(self) -> dict[str, Any]:
         """JSON values: Gaussians, bytes, and the bits per Gaussian of each attribute and of all."""
         bits = {**self.bits, "all": 8 * self.bytes / self.primitives}
-        return {"primitives": self.primitives, "bytes": self.bytes, "bits": {k: round(v, 2) for k, v in bits.items()}}
+        rounded = {name: round(count, 2) for name, count in bits.items()}
+        return {"primitives": self.primitives, "bytes": self.bytes, "bits": rounded}
 
 
 def _check(params: Mapping[str, Tensor]) -> None:
@@ -242,7 +233,7 @@ def _decoded(file: _Sections, n: int, width: int, features: int) -> PackedScene:
 
     def quats() -> Array:
         coded, step = levels("quats", 3)
-        return np.asarray(rotations_at(torch.from_numpy(coded), step).numpy())
+        return np.asarray(quats_at(torch.from_numpy(coded), step).numpy())
 
     def rows(name: str, channels: int) -> Array:
         coded, step = levels(name, channels)
@@ -259,7 +250,7 @@ def _decoded(file: _Sections, n: int, width: int, features: int) -> PackedScene:
         jobs = {name: pool.submit(rows, name, channels) for name, channels in wide.items() if channels}
         jobs["quats"] = pool.submit(quats)
         jobs |= {name: pool.submit(rows, name, channels) for name, channels in narrow.items()}
-        jobs["means"] = pool.submit(dequantize_positions, blocks, bits, size)
+        jobs["means"] = pool.submit(blocks.positions, bits, size)
         gaussians = {name: torch.from_numpy(job.result()) for name, job in jobs.items()}
     gaussians["features_rest"] = gaussians.get("features_rest", torch.zeros(0)).reshape(n, width // 3, 3)
     ordered = {name: gaussians[name] for name in (*SPLAT_NAMES, FEATURES) if name in gaussians}

@@ -30,9 +30,7 @@ _write_basis = borrowing(reference.write_basis)
 
 
 class CpuBackend:
-    """The reference in compiled loops, the same on any number of threads; ``BackendError`` unless the tensors are
-    float32 or float64 on a CPU.
-    """
+    """The reference in compiled loops; ``BackendError`` unless the tensors are float32 or float64 on a CPU."""
 
     name = "cpu"
 

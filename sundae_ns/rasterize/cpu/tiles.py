@@ -63,14 +63,15 @@ def tile_lists(projection: Projection, opacities: Tensor, colors: Tensor, width:
     # The bits of positive floats have the order of the floats.
     keys = depths.view(np.uint32 if depths.dtype == np.float32 else np.uint64)
     ids = _visible_by_depth(keys, *splats[3:5])
-    count, listed = len(ids), 0
+    count = len(ids)
+    listed = 0
     regions = [(0, 0, columns, rows)]
     while regions:
         region = regions.pop()
-        table, boxes = np.empty((count, COLORS + colors.shape[1]), depths.dtype), np.empty((count, 4), np.int32)
-        first_intervals, first_slots = np.zeros(count + 1, np.int64), np.zeros(count + 1, np.int64)
-        measured = (ids, splats, region, table, boxes, first_intervals)
-        parallel_for(_measure, count, *measured, min_per_thread=MIN_PER_THREAD)
+        table = np.empty((count, COLORS + colors.shape[1]), depths.dtype)
+        boxes = np.empty((count, 4), np.int32)
+        first_intervals, first_slots = np.zeros((2, count + 1), np.int64)
+        parallel_for(_measure, count, ids, splats, region, table, boxes, first_intervals, min_per_thread=MIN_PER_THREAD)
         np.cumsum(first_intervals, out=first_intervals)
         halves = _halves(*region)
         pairs = int(first_intervals[-1])  # a Gaussian touches at least one tile in each of its columns

@@ -55,7 +55,7 @@ def test_positions(kind, n, seed):
     x = x[coordinates.scene_order(x)]
     packed, order = module.quantize_positions(x, bits, size)
     assert sorted(order) == list(range(n))
-    found = module.dequantize_positions(packed, bits, size).astype(np.float64)
+    found = packed.positions(bits, size).astype(np.float64)
     half = (packed.high.astype(np.float64) - packed.low) / (2**bits - 1) / 2
     assert (np.abs(found - x[order]) <= half[np.arange(n) // size] * (1 + 1e-9) + ulp(x[order])).all()
     assert ((packed.codes[1:] >= packed.codes[:-1]) | (np.arange(1, n) % size == 0)).all()
@@ -72,7 +72,7 @@ def through_rotations(q, step):
     """Quaternions after a round trip, of axes turned for the smallest rotation."""
     turned, _ = module.aligned(q, np.zeros((len(q), 3), np.float32))
     _, levels, _ = module.Rotations(step).encode(turned)
-    return module.rotations_at(torch.from_numpy(levels), step).numpy()
+    return module.quats_at(torch.from_numpy(levels), step).numpy()
 
 
 def hard_quaternions(n, seed, length):
