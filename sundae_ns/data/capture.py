@@ -46,7 +46,8 @@ def matrix(value: Any, rows: Sequence[int], name: str, where: str) -> np.ndarray
         raise DataError(f"{where}: {name} must have {' or '.join(map(str, rows))} rows of 4 numbers; correct the file")
     for entry in chain(*value):
         finite(entry, name, where)
-    if abs(np.linalg.det((array := np.array(value, np.float64))[:3, :3])) < 1e-9:
+    array = np.array(value, np.float64)
+    if abs(np.linalg.det(array[:3, :3])) < 1e-9:
         raise DataError(f"{where}: {name} is singular, so it is not a camera pose; remove this view")
     return array
 

@@ -63,10 +63,10 @@ class Placed(NamedTuple):
 
 def placed_in(capture: Path) -> Placed:
     """The photos of a capture; ``DataError`` if its ``transforms.json`` is missing or damaged."""
-    meta = read_json(path := capture / TRANSFORMS)
+    meta = read_json(capture / TRANSFORMS)
     frames, left_out = meta.get("frames"), meta.get("left_out", [])
     if not isinstance(frames, list) or not isinstance(left_out, list):
-        raise DataError(f"{path} lists no frames; remove it to make it again")
+        raise DataError(f"{capture / TRANSFORMS} lists no frames; remove it to make it again")
     paths = {str(frame.get("file_path")): frame for frame in frames if isinstance(frame, dict)}
     return Placed({path: str(frame.get("original", path)) for path, frame in paths.items()}, tuple(map(str, left_out)))
 
@@ -178,8 +178,8 @@ def transforms_of(model: Any, sources: Mapping[str, str], *, masked: bool = Fals
 
 
 def _intrinsics(camera: Any) -> dict[str, float]:
-    if len(values := [float(value) for value in camera.params]) == 4:  # SIMPLE_RADIAL, a special case of OPENCV
-        values = [values[0], *values, 0.0, 0.0, 0.0]
+    f, *values = (float(value) for value in camera.params)
+    values = [f, f, *values, 0.0, 0.0, 0.0] if len(values) == 3 else [f, *values]  # SIMPLE_RADIAL is a case of OPENCV
     names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
     return {"w": int(camera.width), "h": int(camera.height), **dict(zip(names, values, strict=True))}
 

@@ -160,8 +160,7 @@ def _images(content: bytes, text: bool) -> Iterator[tuple[int, tuple[float, ...]
         number, *pose, camera = _IMAGE.unpack_from(content, at)
         start = at + _IMAGE.size
         end = content.index(b"\0", start, start + 4096)
-        at = end + 1 + _COUNT.size
-        at += 24 * _COUNT.unpack_from(content, end + 1)[0]
+        at = end + 1 + _COUNT.size + 24 * _COUNT.unpack_from(content, end + 1)[0]
         if at > len(content):
             raise ValueError(f"it ends {at - len(content):,} bytes early")
         yield number, tuple(pose), camera, content[start:end].decode("utf-8")

@@ -37,7 +37,7 @@ from sundae_ns.core.errors import NOTHING_SAVED, ConfigError, passed_on
 from sundae_ns.core.gaussians import FEATURES, Gaussians
 from sundae_ns.core.surgery import change_parameter, per_gaussian
 from sundae_ns.scene.render import GaussianSource, RenderSettings, colors_from, may_be_seen
-from sundae_ns.train.densification import COUNTED, start_counting
+from sundae_ns.train.densification import COUNTED, STATISTICS, count_view, start_counting
 from sundae_ns.train.state import HEAD, Callback, TrainingState
 
 
@@ -134,12 +134,12 @@ class ShardedSource(GaussianSource):
         info, running = state.info, state.densification
         if not state.densifying or info.get(COUNTED):
             return
-        centres, width, height = info["means2d"], info["width"], info["height"]
-        gradients, radii = (centres.absgrad if absgrad else centres.grad)[0], info["radii"][0]
-        norms = torch.hypot(gradients[:, 0] * (width / 2), gradients[:, 1] * (height / 2))
-        shares = (radii if radii.ndim == 1 else radii.amax(dim=-1)).to(norms) / max(width, height)
-        returned = norms.new_empty(sum(self._sent), 2)
-        dist.all_to_all_single(returned, torch.stack([norms, shares], dim=1), self._sent, self._received)
+        centres = info["means2d"]
+        gradients = (centres.absgrad if absgrad else centres.grad)[0]
+        view = {name: gradients.new_zeros(len(gradients)) for name in STATISTICS}
+        count_view(view, gradients, info["radii"][0], info["width"], info["height"])
+        returned = gradients.new_empty(sum(self._sent), 2)
+        dist.all_to_all_single(returned, torch.stack([view["grad2d"], view["radii"]], 1), self._sent, self._received)
         start_counting(running, self.gaussians["means"])
         norms, shares = returned.to(running["grad2d"]).unbind(dim=1)
         running["grad2d"].index_add_(0, self._rows, norms)
