@@ -35,7 +35,7 @@ def render(
 
     Args:
         out: image (.png, .jpg or .webp) or video (.mp4) to write.
-        view: index of the camera for an image; by default the start view of the scene, if it has one.
+        view: index of the camera of an image; by default the start view of the scene, if it has one.
         width: width of the images in pixels; by default that of the camera, in a film at most 1,280 a side.
         seconds: length of a film; by default 12.
         fps: frames a second of a video; by default those of the camera path, else 24.
@@ -47,17 +47,16 @@ def render(
     wishes.check_wishes()
     check_file(out, reads=[scene, advanced.cameras], overwrite=advanced.overwrite)
     edit = opened(scene, wishes, advanced, most=MOST_CAMERAS)
-    left, speed = edit.reduced(Path("scene.sundae")).stated, edit.speed
+    left, speed = edit.reduced(Path("scene.sundae")).stated.to(fastest_device()), edit.speed
     views = list(left.cameras)
-    if seconds is not None and (speed is not None or not video):
-        raise ConfigError("--seconds is the length of a film without a camera path; leave it out")
+    if (seconds is not None and (speed is not None or not video)) or (video and view is not None):
+        raise ConfigError("--seconds is the length of a film without a camera path, --view of an image; leave it out")
     if video and speed is None:
         with Console(stderr=True).status("Finding a path"):
             views = film_views(left, seconds=12.0 if seconds is None else seconds, frames_per_second=fps or 24)
     elif (view is None and advanced.cameras is None) or not views:
         views = [start] if (start := opening(left).start) is not None else views
     views = [each if width is None else each.zoomed(width / each.width) for each in views]
-    left = left.to(fastest_device())
     if video:  # whose colours have half the size
         views = [each._replace(width=each.width // 2 * 2, height=each.height // 2 * 2) for each in views]
         speed = fps or speed or 24
@@ -67,7 +66,8 @@ def render(
         print(f"{out}: {count} frames of {views[0].width} x {views[0].height} px, {count / speed:.1f} s")
         return 0
     if (view is None and len(views) > 1) or not 0 <= (index := view or 0) < len(views):
-        raise ConfigError(f"there are {len(views)} cameras; give --view 0 to {len(views) - 1}, or write an .mp4")
+        several = f"there are {len(views)} cameras; give --view 0 to {len(views) - 1}, or write an .mp4"
+        raise ConfigError(several if len(views) > 1 else "there is one camera; leave out --view")
     write_image(out, image_of(render_view(left, views[index]).rgb))
     print(f"{out}: {views[index].width} x {views[index].height} px")
     return 0

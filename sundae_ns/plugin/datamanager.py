@@ -169,7 +169,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         folder, is_colmap = self.config.capture, isinstance(parser, ColmapDataParserConfig)
         folder = folder.parent if folder.is_file() else folder
         if outputs.mask_filenames is None and (masks := unused_masks(folder)) is not None:
-            how = f"colmap --masks-path {masks}" if is_colmap else "mask_path in each frame of transforms.json"
+            how = f"colmap --masks-path {masks} (sundae train: --masks)" if is_colmap else "mask_path in each frame"
             _log.warning(f"{folder / masks} is not used; to leave out what its masks hide, give {how}")
         if is_colmap and (larger := larger_model(folder, parser.colmap_path)) is not None:
             _log.warning(larger)

@@ -95,7 +95,7 @@ REFUSALS = {
     "render in.sundae -o a.png --view 0 --width 1": "width is 1; give at least 2",
     "render in.sundae -o a.png --view 0 --fps 9": "--fps is of a video",
     "render in.sundae -o a.png --view 0 --seconds 9": "--seconds is the length of a film",
-    "render in.sundae -o a.png --seconds 9": "--seconds is the length of a film",
+    "render in.sundae -o a.mp4 --view 0": "--view of an image; leave it out",
     "render in.sundae -o a.mp4 --fps nan": "--fps is of a video",
     "render in.sundae -o a.png --cameras damaged.json": "damaged.json is not JSON",
     "render in.sundae -o a.png --cameras none.json": "none.json",
