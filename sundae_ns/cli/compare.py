@@ -71,8 +71,7 @@ def compare(
     from sundae_ns.report.measure import against_first, against_photos, csv_text, labels_of, markdown, measure
     from sundae_ns.report.report_page import ShownRun, report_page, shown_views
 
-    repeats = (5 if photos else 0) if repeats is None else repeats
-    command = shlex.join(["sundae", *typed])
+    repeats, command = (5 if photos else 0) if repeats is None else repeats, shlex.join(["sundae", *typed])
     lpips = Lpips(lpips_net) if photos and lpips_weights(lpips_net)[1].is_file() else None
     missing = f"LPIPS: the weights of its net ({lpips_net}) are missing; sundae doctor says where to put them."
     notes = [missing] if photos and lpips is None else []

@@ -26,8 +26,9 @@ ENVIRONMENT = {
     # glibc would return the memory of each step's images to the system.
     "MALLOC_MMAP_THRESHOLD_": str(2**25),
     "MALLOC_TRIM_THRESHOLD_": str(2**28),
+    "USER": str(os.getuid()),  # torch asks for a name; a container's user may have no account
 }
-"""Variables of threads and memory; those that the user has set stay."""
+"""Variables of threads, memory and the account; those that the user has set stay."""
 COMMANDS = {
     "run": "photos or a video to a packed scene, its report and its web page; resumes",
     "poses": "camera poses of photos or of a video: a capture to train on; resumes",

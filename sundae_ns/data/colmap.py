@@ -168,13 +168,12 @@ def _images(content: bytes, text: bool) -> Iterator[tuple[int, tuple[float, ...]
 
 def _rows(content: bytes, *, images: bool = False) -> list[list[str]]:
     """Words of the entries of a text. An image has a second line, and a name that may have spaces."""
-    lines = map(str.strip, re.split(r"\r\n|\r|\n", content.decode("utf-8-sig")))
-    rows = []
+    lines, rows = map(str.strip, re.split(r"\r\n|\r|\n", content.decode("utf-8-sig"))), []
     for line in lines:
         if line and not line.startswith("#"):
             rows.append(line.split(maxsplit=9 if images else -1))
-            if images:
-                next(lines, None)  # observations, which may be an empty line
+            if images and not re.fullmatch(r"(?:.*\s)?-?[\d.]+|#.*|", next(lines, "")):
+                raise ValueError(f"after image {line.split()[0]} stands no line of observations, which may be empty")
     # A text cut between two lines has no other sign.
     if (stated := re.search(rb"^# Number of \w+: (\d+)", content, re.MULTILINE)) and int(stated[1]) != len(rows):
         raise ValueError(f"it states {int(stated[1]):,} entries and has {len(rows):,}")

@@ -31,7 +31,7 @@ _MODES |= dict.fromkeys(("P", "PA", "RGB", "RGBA", "YCbCr"), "RGB")
 HIGH_RANGE = PQ, HLG = 16, 18  # transfers
 # Chromaticities of red, green and blue, of BT.709 and sRGB, of BT.2020 and of Display P3; white is D65.
 _SRGB = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06)
-_PRIMARIES = {9: (0.708, 0.292, 0.170, 0.797, 0.131, 0.046), 12: (0.680, 0.320, 0.265, 0.690, 0.150, 0.060)}
+PRIMARIES = {9: (0.708, 0.292, 0.170, 0.797, 0.131, 0.046), 12: (0.680, 0.320, 0.265, 0.690, 0.150, 0.060)}
 _ADOBE = 563 / 256, (0.64, 0.33, 0.21, 0.71, 0.15, 0.06)  # Adobe RGB (1998), an exponent and primaries
 _WHITE = 203.0  # cd/m2, of a white sheet (Report ITU-R BT.2408); HLG is for a display of 1,000
 _KNEE = 0.46  # share of white from which a high range is rolled off
@@ -139,7 +139,7 @@ def _conversion(image: Image.Image) -> Callable[[Image.Image], Any] | None:
             stated = cicp[1], cicp[0]
         elif image.format == "PNG" and "srgb" not in image.info:
             gamma, xy = image.info.get("gamma", 1 / 2.2), tuple(image.info.get("chromaticity", (0, 0, *_SRGB))[2:])
-            if np.abs(np.subtract((gamma, *xy), (1 / 2.2, *_SRGB))).max() > 0.005:
+            if 0.1 < gamma < 10 and np.abs(np.subtract((gamma, *xy), (1 / 2.2, *_SRGB))).max() > 0.005:
                 _to_xyz(xy)  # raises for those of no colour space
                 stated = 1 / gamma, xy
         elif "nclx_profile" in image.info:
@@ -149,7 +149,7 @@ def _conversion(image: Image.Image) -> Callable[[Image.Image], Any] | None:
             interop, inner = (image.getexif().get_ifd(kind) for kind in (ExifTags.IFD.Interop, ExifTags.IFD.Exif))
             stated = _ADOBE if interop.get(1) == "R03" or inner.get(ExifTags.Base.ColorSpace) == 2 else stated
     narrow = cicp is not None and cicp[3:] == b"\0"
-    if stated[0] not in _LIGHT and stated[1] not in _PRIMARIES and not isinstance(stated[0], float) and not narrow:
+    if stated[0] not in _LIGHT and stated[1] not in PRIMARIES and not isinstance(stated[0], float) and not narrow:
         return None
     levels = [round((code - 16) * 255 / 219) if narrow else code for code in range(256)] * 3
     return lambda base: Image.fromarray(to_srgb_values(np.asarray(base.convert("RGB").point(levels)), *stated))
@@ -181,7 +181,7 @@ def to_srgb_values(values: NDArray[Any], transfer: float, primaries: Any) -> NDA
     light = codes**transfer if isinstance(transfer, float) else _LIGHT[transfer](codes) if transfer in _LIGHT else light
     light = light.astype(np.float32)[values]
     if not isinstance(primaries, tuple):
-        primaries = _PRIMARIES.get(primaries, _PRIMARIES[9] if transfer in HIGH_RANGE else _SRGB)
+        primaries = PRIMARIES.get(primaries, PRIMARIES[9] if transfer in HIGH_RANGE else _SRGB)
     if transfer == HLG:
         light *= 1000 / _WHITE * (light @ np.array([0.2627, 0.6780, 0.0593], np.float32))[..., None] ** np.float32(0.2)
     light = light @ np.linalg.solve(_to_xyz(_SRGB), _to_xyz(primaries)).T.astype(np.float32)

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from sundae_ns.core.errors import DataError, reading, regular, writing
-from sundae_ns.data.images import HIGH_RANGE, JPEG, to_srgb_values
+from sundae_ns.data.images import HIGH_RANGE, JPEG, PRIMARIES, to_srgb_values
 from sundae_ns.data.photos import LEAST_PHOTOS, check_shape
 
 SUFFIXES = tuple(".mp4 .mov .m4v .avi .mkv .webm .mpg .mpeg .mts .m2ts .ts .3gp .wmv .flv .ogv".split())
@@ -64,19 +64,20 @@ def image_of(frame: Any, path: Path, aspect: float = 1.0) -> Image.Image:
     """A frame (``av.VideoFrame``) as an upright image in sRGB; ``DataError`` if it states colours not known here.
 
     Its own matrix and range count; without a matrix BT.709 from 1280 x 577 on and BT.601 below, as in players. A high
-    dynamic range is rolled off; other transfers and gamuts stay. Pixels ``aspect`` times as wide as high become square.
+    dynamic range is rolled off, and the gamuts of BT.2020 and P3 are converted; what else is stated counts as BT.709.
+    Pixels ``aspect`` times as wide as high become square.
     """
-    matrix, transfer = int(frame.colorspace), int(frame.color_trc)
+    matrix, transfer, primaries = int(frame.colorspace), int(frame.color_trc), int(frame.color_primaries)
     if matrix in _UNSTATED:
         matrix = 1 if frame.width >= 1280 or frame.height > 576 else 5
     if matrix not in _MATRICES or transfer in _NOT_SHOWN:
         what = f"{_NOT_SHOWN[transfer]} light" if transfer in _NOT_SHOWN else f"a colour matrix of number {matrix}"
         raise DataError(f"{path} has {what}, which is not read; convert it to BT.709, for example with HandBrake")
-    kind = "rgb48le" if transfer in HIGH_RANGE else "rgb24"
+    is_wide = transfer in HIGH_RANGE or primaries in PRIMARIES
     size = round(frame.width * max(aspect, 1.0)), round(frame.height / min(aspect, 1.0))
-    pixels = frame.reformat(*size, kind, src_colorspace=matrix, src_color_range=int(frame.color_range)).to_ndarray()
-    if transfer in HIGH_RANGE:
-        pixels = to_srgb_values(pixels, transfer, int(frame.color_primaries))
+    options = {"src_colorspace": matrix, "src_color_range": int(frame.color_range)}
+    pixels = frame.reformat(*size, "rgb48le" if is_wide else "rgb24", **options).to_ndarray()
+    pixels = to_srgb_values(pixels, transfer, primaries) if is_wide else pixels
     for data in frame.side_data:
         if (shape := f"{data.type.name} {next(iter(bytes(data)), '')}") in _NO_VIEWS:
             raise DataError(f"{path} {_NO_VIEWS[shape]}")

@@ -336,6 +336,9 @@ def read_ply(path: Path) -> dict[str, Tensor]:
     if missing and not is_flat:
         raise DataError(f"{path} lacks {', '.join(missing)}; give a .ply of 3D Gaussians with SH colours.")
     columns["scales"] = columns["scales"][: 2 if is_flat else 3]
+    for name in {*_COLUMNS["features_dc"], *columns["scales"], *columns["quats"]} & present:
+        if rows[name].dtype.kind in "iu":
+            raise DataError(f"{path} has codes of a table for {name}, not its values; export it again as floats.")
     rest = sum(name.startswith("f_rest_") for name in present)
     degree = sh_degree_of(rest // 3) if rest % 3 == 0 else None
     if degree is None or not present.issuperset(f"f_rest_{i}" for i in range(rest)):

@@ -272,8 +272,7 @@ def _decoded(file: Entry, meta: Mapping[str, Any], size: int) -> dict[str, Tenso
     low, high = (np.asarray(meta["means"][end], np.float64) for end in ("mins", "maxs"))
     if n != float(meta["count"]) or {low.shape, high.shape} != {(3,)}:
         raise ValueError("its count is no whole number, or mins and maxs of its means are not three numbers each")
-    levels = pixels(meta["means"], 0, 3) + 256.0 * pixels(meta["means"], 1, 3)
-    bent = low + levels / _LEVELS * (high - low)
+    bent = low + (pixels(meta["means"], 0, 3) + 256.0 * pixels(meta["means"], 1, 3)) / _LEVELS * (high - low)
     color = pixels(meta["sh0"], 0, 4)
     opacity = np.clip(color[:, 3:] / 255.0, 1e-3 / 255, 1 - 1e-6)
     turns = pixels(meta["quats"], 0, 4)
@@ -378,8 +377,7 @@ def _nearest_centre(rows: Tensor, centres: Tensor) -> Tensor:
 def _smallest_three(quats: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Unit quaternions wxyz as pixels, both ``[N, 4]``: the three smallest components, and the index of the largest."""
     largest = np.abs(quats).argmax(axis=1)
-    rows = np.arange(len(quats))
-    positive = quats * np.where(quats[rows, largest] < 0, -1, 1)[:, None]
+    positive = quats * np.where(quats[np.arange(len(quats)), largest] < 0, -1, 1)[:, None]
     others = positive[np.arange(4) != largest[:, None]].reshape(-1, 3)
     codes = np.rint((others * math.sqrt(0.5) + 0.5) * 255).clip(0, 255)
     return np.concatenate([codes, _FIRST_MODE + largest[:, None]], axis=1).astype(np.uint8)

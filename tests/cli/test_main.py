@@ -1,5 +1,6 @@
 """The ``sundae`` command itself: help, exit codes, names that are no text, warnings of libraries."""
 
+import getpass
 import io
 import os
 import subprocess
@@ -47,6 +48,12 @@ def test_other_errors_are_not_hidden(monkeypatch):
     monkeypatch.setattr("sundae_ns.cli.doctor.parts", Mock(side_effect=ZeroDivisionError))
     with pytest.raises(ZeroDivisionError):
         main(["doctor"])
+
+
+def test_a_user_without_an_account_has_a_name(monkeypatch):
+    monkeypatch.setattr("os.environ", {})
+    run("--version")
+    assert getpass.getuser() == str(os.getuid())  # torch asks for it, in a container too
 
 
 @pytest.mark.parametrize("chosen", [None, "ACTIVE"])

@@ -104,7 +104,7 @@ CHUNKS = {
     "linear by cICP": ({"cICP": bytes((1, 8, 0, 1))}, LINEAR, 1),
     "PQ": ({"cICP": bytes((9, 16, 0, 1))}, HDR, 0),
     "no primaries": ({"cHRM": [0] * 8}, None, 0),
-    "a gamma of zero": ({"gAMA": [0]}, None, 0),
+    "no gamma": ({"gAMA": [2_000_000_000]}, None, 0),
     "a short cICP": ({"cICP": b"\14"}, None, 0),
     "limited range": ({"cICP": bytes((1, 13, 0, 0))}, NARROW, 1),
 }

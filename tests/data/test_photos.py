@@ -79,7 +79,6 @@ ODD = {
     "a pipe": (os.mkfifo, "it is a pipe or a device"),
     "a raw pipe": (lambda path: os.mkfifo(path.with_suffix(".cr2")), "it is a pipe or a device"),
     "a raw photo of text": (lambda path: path.with_suffix(".cr2").write_text("II*"), "is not a photo"),
-    "a device": (lambda path: path.symlink_to("/dev/zero"), "it is a pipe or a device"),
     "a dangling link": (lambda path: path.symlink_to("gone.png"), "does not exist"),
     "text": (lambda path: path.write_text("not a photo"), "cannot identify image file"),
     "another format": (lambda path: photo(path, "ppm"), "is a PPM file by its contents"),
@@ -90,7 +89,6 @@ ODD = {
     "a panorama of an iPhone": (lambda path: photo(path, panorama=True), "a panorama: leave it"),
     "a scan 300 times": (scans, r"it has 3\d\d scans"),
     "a line": (lambda path: photo(path, size=(8000, 2)), "8000 x 2 px, too narrow for camera poses"),
-    "a column": (lambda path: photo(path, size=(20, 8000)), "20 x 8000 px, too narrow for camera poses"),
 }
 
 

@@ -232,6 +232,7 @@ WRONG = {
     "Brush's 4D": (_header(b"end_header", b"element delta_vertex_0 0\nproperty uchar x\nend_header"), "holds 4D"),
     "Scaffold-GS": (_with("f_offset_0", "f_anchor_feat_0", without="f_"), "network for its colours .f_anchor_feat_0."),
     "features for colours": (_with("color_feature_0", without="f_"), "a network for its colours"),
+    "codes": (_columns(lambda c: c | {"rot_2": np.zeros(7, np.uint8)}), "has codes of a table for rot_2"),
     "lists": (_columns(_lists), "property corners of each vertex .* is a list"),
     "widths": (_columns(lambda columns: dict.fromkeys(columns, np.full(200, 0.5, "f4"))), "not their logarithms"),
     "shares": (_columns(lambda c: dict.fromkeys(c, np.zeros(200)) | {"opacity": np.linspace(0, 1, 200)}), "not their"),

@@ -238,8 +238,7 @@ def _decoded(file: _Sections, n: int, width: int, features: int) -> PackedScene:
     def rows(name: str, channels: int) -> Array:
         coded, step = levels(name, channels)
         mean = _array(file, name, "mean", width=channels)
-        basis = _array(file, name, "basis", square=channels**2).reshape(channels, channels)
-        return rows_at(coded, mean, basis, step)
+        return rows_at(coded, mean, _array(file, name, "basis", square=channels**2).reshape(channels, channels), step)
 
     with ThreadPoolExecutor(2) as pool:
         # A head needs no positions. Then the largest jobs come first, so that the threads end together.
