@@ -40,9 +40,8 @@ def rotate_spherical_harmonics(features_rest: Tensor, rotation: Tensor) -> Tenso
     max_degree = sh_degree(features_rest)
     generator = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn(64, 3, generator=generator, dtype=torch.float64), dim=1)
-    before = harmonic_basis(max_degree, directions)
     after = harmonic_basis(max_degree, directions @ rotation.double().cpu().mT)
-    before = before.expand_as(after)
+    before = harmonic_basis(max_degree, directions).expand_as(after)
     rotated = features_rest.repeat(*rotation.shape[:-2], 1, 1, 1)
     for degree in range(1, max_degree + 1):
         columns = slice(degree**2, (degree + 1) ** 2)
@@ -140,16 +139,16 @@ def separate(codes: NDArray[np.uint64], axis: int) -> NDArray[np.uint64]:
     return x
 
 
-def scene_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Permutation ``[N]`` that sorts finite centres ``[N, 3]`` along a space-filling curve.
+def scene_order(means: NDArray[np.float32]) -> tuple[NDArray[np.int64], int]:
+    """Permutation ``[N]`` of finite centres ``[N, 3]`` along a space-filling curve, far ones last; number of others.
 
     Coordinates are centred on their medians and compressed by an inverse hyperbolic sine, so that a few far Gaussians
-    do not push all others into one cell.
+    do not push all others into one cell. Far ones, beyond 100 times the spread, come by powers of two of the distance.
     """
     centred = means.astype(np.float64) - np.median(means, axis=0)
-    spread = np.median(np.abs(centred))
-    if spread == 0:
-        spread = np.abs(centred).mean() or 1.0
-    bent = np.arcsinh(centred / spread)
+    centred /= np.median(np.abs(centred)) or np.abs(centred).mean() or 1.0
+    bent = np.arcsinh(centred)
     low, extent = bent.min(axis=0), np.ptp(bent, axis=0).max() or 1.0
-    return np.argsort(interleave(((bent - low) / extent * (2**MAX_BITS - 1)).astype(np.uint64)), kind="stable")
+    shells = np.ceil(np.log2((np.abs(centred).max(axis=1) / 100).clip(min=1)))
+    codes = interleave(((bent - low) / extent * (2**MAX_BITS - 1)).astype(np.uint64))
+    return np.lexsort((codes, shells)), int((shells == 0).sum())

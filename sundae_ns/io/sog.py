@@ -66,7 +66,7 @@ Entry = Callable[[str], bytes]  # the content of a file by its name beside the f
 def write_sog(path: Path, params: Mapping[str, Tensor], marks: Marks = UNMARKED) -> None:
     """Write the base colours of Gaussians that ``ply.checked`` accepts as a .sog, atomically, in another order."""
     gaussians = checked(path, params)
-    order = scene_order(gaussians["means"].numpy())
+    order, _ = scene_order(gaussians["means"].numpy())
     with replacing(path) as unfinished, zipfile.ZipFile(unfinished, "w", zipfile.ZIP_STORED) as bundle:
         for name, content in _encoded({name: value.numpy()[order] for name, value in gaussians.items()}, marks).items():
             bundle.writestr(zipfile.ZipInfo(name), content)  # with a fixed date: equal scenes give equal bytes
@@ -80,7 +80,7 @@ def write_streamed(folder: Path, levels: Sequence[Mapping[str, Tensor]], marks: 
     arrays: list[dict[str, NDArray[np.float32]]] = []
     for params in levels:
         gaussians = checked(folder / STREAMED, params)
-        order = scene_order(gaussians["means"].numpy())
+        order, _ = scene_order(gaussians["means"].numpy())
         reach = 3 * entries_of(gaussians)[:, :3].sqrt().float()
         gaussians |= {"min": gaussians["means"] - reach, "max": gaussians["means"] + reach}
         arrays.append({name: value.numpy()[order] for name, value in gaussians.items()})

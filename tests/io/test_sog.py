@@ -75,7 +75,7 @@ def test_values_come_back(tmp_path, degree):
     meta, found = read(tmp_path / "a.sog")
     assert (meta["version"], meta["count"]) == (2, 150)
     assert all(len(meta[name]["codebook"]) == 256 for name in ("scales", "sh0", *(["shN"] if degree else [])))
-    order = scene_order(truth["means"].numpy())
+    order, _ = scene_order(truth["means"].numpy())
     truth = {name: value[torch.from_numpy(order)] for name, value in truth.items()}
     # Half a level of an axis, times the largest slope of the inverse.
     step = (np.array(meta["means"]["maxs"]) - meta["means"]["mins"]) / 65535

@@ -75,8 +75,7 @@ def quantize_positions(means: Floats, bits: int, size: int) -> tuple[Blocks, NDA
     starts = np.arange(0, n, size)
     low, high = np.minimum.reduceat(means, starts), np.maximum.reduceat(means, starts)
     block = np.arange(n) // size
-    extent = high.astype(np.float64) - low
-    extent[extent == 0] = 1.0
+    extent = np.where(high > low, high.astype(np.float64) - low, 1.0)
     cells = np.rint((means.astype(np.float64) - low[block]) / extent[block] * (2**bits - 1)).astype(np.uint64)
     codes = interleave(cells)
     order = np.lexsort((codes, block))
@@ -211,8 +210,9 @@ def fit_transform(rows: Floats, step: float, *, centred: bool = True, form: Tens
     products = np.zeros_like(root)
     for start in range(0, len(rows), _PART):
         values = (rows[start : start + _PART].astype(np.float64) - mean) @ root
-        # Divide rows by the square root of their length, so that a few huge rows do not dominate the basis.
-        values /= np.sqrt(np.maximum(np.linalg.norm(values, axis=1, keepdims=True), step))
+        # Rows weigh the square root of their length, and long ones no more, so that no huge row decides the basis.
+        length = np.linalg.norm(values, axis=1, keepdims=True).clip(min=step)
+        values /= np.sqrt(length * (length / (100 * step)).clip(min=1))
         products += values.T @ values
     axes = np.linalg.eigh(products)[1][:, ::-1].T @ back
     largest = float(np.abs(axes).max()) if form is not None else 1.0
@@ -388,30 +388,31 @@ def fit_codecs(
     """Gaussians in the stored order, with rounded positions, and codecs fitted to them and to a head; {} for none."""
     names = [name for name in (*SPLAT_NAMES, FEATURES) if name in gaussians]
     values = {name: as_matrix(gaussians[name]) for name in names}
-    order = scene_order(values["means"])
+    order, near = scene_order(values["means"])
+    if near < len(order):  # far ones make a block coarse, so the near ones fill whole blocks
+        sizes = range(config.block, max(config.block // 2, 15), -1)
+        config = replace(config, block=min(sizes, key=lambda size: max(near % size, 16)))
     while True:
         blocks, within = quantize_positions(values["means"][order], config.position_bits, config.block)
         grid = (blocks.high / 2**config.position_bits - blocks.low / 2**config.position_bits).max(axis=1)
         widths = np.exp(values["scales"].max(axis=1).clip(max=80))[order[within]]
-        if (grid[np.arange(len(order)) // config.block] > 3 * widths).mean() < 1e-3 or config.block <= 16:
+        coarse = (grid[np.arange(len(order)) // config.block] > 3 * widths)[:near]
+        if coarse.mean() < 1e-3 or config.block <= 16:
             break
-        config = replace(config, block=max(config.block // 4, 16))  # what lies far away makes its whole block coarse
+        config = replace(config, block=max(config.block // 4, 16))
     order = order[within]
     values = {name: value[order] for name, value in values.items()}
     values["means"] = blocks.positions(config.position_bits, config.block)
     values["quats"], values["scales"] = aligned(values["quats"], values["scales"])
     values["opacities"] = values["opacities"].clip(*_LOGITS)
-    forms = {} if sensitivity is None else sensitivity.rows
-    codecs: dict[str, Rotations | Transform] = {}
+    seen = sensitivity or Sensitivity({}, {})
+    codecs: dict[str, Rotations | Transform] = {"quats": Rotations(config.rotation_step)}
     for name, option in _STEPS.items():
-        step = getattr(config, option)
-        if name == "quats":
-            codecs[name] = Rotations(step)
-        elif name in values and values[name].size:
-            codecs[name] = fit_transform(values[name], step, centred=name != "features_rest", form=forms.get(name))
+        if name != "quats" and name in values and values[name].size:
+            step, form = getattr(config, option), seen.rows.get(name)
+            codecs[name] = fit_transform(values[name], step, centred=name != "features_rest", form=form)
     ordered = {name: torch.from_numpy(values[name]).reshape(gaussians[name].shape) for name in names}
-    of_head = {} if sensitivity is None else sensitivity.head
-    return ordered, Codecs(config, blocks, codecs, _fit_head(head, config.head_step, of_head))
+    return ordered, Codecs(config, blocks, codecs, _fit_head(head, config.head_step, seen.head))
 
 
 def _fit_head(head: Mapping[str, Tensor], share: float, sensitivity: Mapping[str, Tensor]) -> HeadCodec | None:
