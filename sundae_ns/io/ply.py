@@ -345,9 +345,10 @@ def read_ply(path: Path) -> dict[str, Tensor]:
         raise DataError(f"{path} has {rest} f_rest properties, which fit no SH degree; export it again.")
     params = {name: _columns(rows, names) for name, names in columns.items() if name != "means"}
     params["means"] = _columns(rows, columns["means"], np.result_type(np.float32, *(rows[x].dtype for x in "xyz")))
-    alphas, wide = params["opacities"], (params["scales"] > 0).all()
+    alphas, scales, wide = params["opacities"], params["scales"], (params["scales"] > 0).all()
     # No real scene has such logarithms and logits throughout.
-    if len(rows) > 99 and bool(((alphas - 0.5).abs() <= 0.5).all() & (wide | (alphas.max() - alphas.min() > 0.5))):
+    shares = ((alphas - 0.5).abs() <= 0.5).all() and (wide or alphas.max() - alphas.min() > 0.5)
+    if len(rows) > 99 and (shares or (wide and scales.median() < 0.1)):
         raise DataError(f"{path} has widths and opacities, not their logarithms and logits; export it again.")
     if is_flat:
         params["scales"] = torch.nn.functional.pad(params["scales"], (0, 1), value=-math.inf)

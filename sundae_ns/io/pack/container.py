@@ -279,8 +279,7 @@ def read_sections(path: Path, header: Header) -> dict[str, Array]:
             size, ends = section.size // len(section.parts), accumulate(section.parts)
             planes = [_inflated(stored[end - part : end], size) for end, part in zip(ends, section.parts)]
             table = np.frombuffer(b"".join(planes), np.uint8).reshape(_rows(section.shape), section.dtype.itemsize, -1)
-            numbers = np.ascontiguousarray(table.transpose(0, 2, 1)).reshape(-1).view(section.dtype)
-            return numbers.reshape(section.shape)
+            return np.ascontiguousarray(table.transpose(0, 2, 1)).reshape(-1).view(section.dtype).reshape(section.shape)
 
         with ThreadPoolExecutor(2) as pool:
             arrays = dict(zip(header.sections, pool.map(decode, header.sections.values()), strict=True))
