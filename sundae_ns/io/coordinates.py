@@ -143,12 +143,12 @@ def scene_order(means: NDArray[np.float32]) -> tuple[NDArray[np.int64], int]:
     """Permutation ``[N]`` of finite centres ``[N, 3]`` along a space-filling curve, far ones last; number of others.
 
     Coordinates are centred on their medians and compressed by an inverse hyperbolic sine, so that a few far Gaussians
-    do not push all others into one cell. Far ones, beyond 100 times the spread, come by powers of two of the distance.
+    do not push all others into one cell. Far ones, beyond 30 times the spread, come by powers of two of the distance.
     """
     centred = means.astype(np.float64) - np.median(means, axis=0)
     centred /= np.median(np.abs(centred)) or np.abs(centred).mean() or 1.0
     bent = np.arcsinh(centred)
     low, extent = bent.min(axis=0), np.ptp(bent, axis=0).max() or 1.0
-    shells = np.ceil(np.log2((np.abs(centred).max(axis=1) / 100).clip(min=1)))
+    shells = np.ceil(np.log2((np.abs(centred).max(axis=1) / 30).clip(min=1)))
     codes = interleave(((bent - low) / extent * (2**MAX_BITS - 1)).astype(np.uint64))
     return np.lexsort((codes, shells)), int((shells == 0).sum())

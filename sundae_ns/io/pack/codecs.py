@@ -389,17 +389,15 @@ def fit_codecs(
     names = [name for name in (*SPLAT_NAMES, FEATURES) if name in gaussians]
     values = {name: as_matrix(gaussians[name]) for name in names}
     order, near = scene_order(values["means"])
-    if near < len(order):  # far ones make a block coarse, so the near ones fill whole blocks
-        sizes = range(config.block, max(config.block // 2, 15), -1)
-        config = replace(config, block=min(sizes, key=lambda size: max(near % size, 16)))
-    while True:
-        blocks, within = quantize_positions(values["means"][order], config.position_bits, config.block)
+    whole = min(range(config.block, max(config.block // 2, 15), -1), key=lambda size: max(near % size, 16))
+    for block in (config.block, whole, *(max(config.block >> bits, 16) for bits in (2, 4, 6))):
+        # What lies far away makes a block coarse: blocks that the near ones fill, and else smaller ones, mend that.
+        config = replace(config, block=block)
+        blocks, within = quantize_positions(values["means"][order], config.position_bits, block)
         grid = (blocks.high / 2**config.position_bits - blocks.low / 2**config.position_bits).max(axis=1)
         widths = np.exp(values["scales"].max(axis=1).clip(max=80))[order[within]]
-        coarse = (grid[np.arange(len(order)) // config.block] > 3 * widths)[:near]
-        if coarse.mean() < 1e-3 or config.block <= 16:
+        if (grid[np.arange(len(order)) // block] > 3 * widths)[:near].mean() < 1e-3:
             break
-        config = replace(config, block=max(config.block // 4, 16))
     order = order[within]
     values = {name: value[order] for name, value in values.items()}
     values["means"] = blocks.positions(config.position_bits, config.block)
