@@ -293,7 +293,7 @@ def cells_of(runs: Sequence[Measured]) -> tuple[list[str], list[list[str]]]:
     """Heads, and the cells of each configuration of some scenes; columns in which nothing is measured are left out."""
     nets = sorted({run.lpips_net for run in runs if run.full.mean("lpips") is not None})
     heads = ["scene", "rendered with", "Gaussians", "MB", "ms per frame", "PSNR, dB", "worst, dB", "SSIM"]
-    heads += ["fitted, dB", f"LPIPS ({', '.join(nets)})"]
+    heads += ["colours fitted, dB", f"LPIPS ({', '.join(nets)})"]
     no_head = "no head" if any(run.has_head for run in runs) else "-"
     rows = []
     for run in runs:
