@@ -26,7 +26,7 @@ ENVIRONMENT = {
     # glibc would return the memory of each step's images to the system.
     "MALLOC_MMAP_THRESHOLD_": str(2**25),
     "MALLOC_TRIM_THRESHOLD_": str(2**28),
-    "USER": str(os.getuid()),  # torch asks for a name; a container's user may have no account
+    "USER": str(getattr(os, "getuid", int)()),  # torch asks for a name; a container's user may have no account
 }
 """Variables of threads, memory and the account; those that the user has set stay."""
 COMMANDS = {
