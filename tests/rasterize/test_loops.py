@@ -45,7 +45,7 @@ def test_every_blended_pixel_is_listed_and_few_others(dtype):
     values = (means, torch.randn(n, 4, generator=generator), scales, *camera)
     projection = project(geometry(*(value.to(dtype) for value in values), width, height))
     # The faint opacity ends footprints inside gsplat's three-sigma bins, so the bins do not matter here.
-    (lists,) = tile_lists(projection, torch.full((n,), 0.2, dtype=dtype), torch.ones(n, 3, dtype=dtype), width, height)
+    (lists,) = tile_lists(projection, torch.full((n,), 0.2, dtype=dtype), width, height)
     table = lists.table.astype(np.float64)
     y, x = np.mgrid[: -(-height // TILE) * TILE, : lists.columns * TILE] + 0.5
     listed = np.zeros((len(lists.ids), *x.shape), bool)

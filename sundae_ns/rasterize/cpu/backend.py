@@ -41,7 +41,7 @@ class CpuBackend:
         opacities, colors = blended_values(inputs, projection)
         means2d = projection.means2d[None]
         size = inputs.camera.width, inputs.camera.height
-        lists = partial(tile_lists, projection, opacities, colors, *size)
+        lists = partial(tile_lists, projection, opacities, *size)
         image, alpha = composite(means2d, projection.conics, opacities, colors, size, lists, inputs.absgrad)
         return result_of(image, alpha, means2d, projection.radii, inputs)
 
@@ -107,7 +107,7 @@ def project(inputs: Inputs) -> Projection:
     planes = np.array([inputs.near_plane, inputs.far_plane], np.float32 if means.dtype == torch.float32 else np.float64)
     camera = (as_array(viewmat.double()), lens, size, planes.astype(np.float64), limits)
     n = len(means)
-    new = (*(means.new_zeros(n, *size) for size in ((2,), (3,), (), (), (3,))), means.new_zeros(n, dtype=torch.int32))
+    new = (*(means.new_empty(n, *size) for size in ((2,), (3,), (), (), (3,))), means.new_empty(n, dtype=torch.int32))
     loops = _project, _project_backward, MIN_PER_THREAD
     outputs = _Loops.apply(loops, camera, new, 4, means, inputs.quats, inputs.scales)
     means2d, conics, depths, compensations, covars2d, radii = outputs
@@ -171,19 +171,16 @@ def _footprint(camera: Any, quats: Any, scales: Any, i: int, x: float, y: float,
 
 @compiled
 def _project(begin: int, end: int, camera: Any, means: Any, quats: Any, scales: Any, outputs: Any) -> None:
-    _, lens, size, _, limits = camera
+    _, lens, size, _, _ = camera
     means2d, conics, depths, compensations, covars2d, radii = outputs
     arrays = _arrays()
-    # A radius is at most reach times the largest scale, over z, beside blur and rounding: see scene.render.may_be_seen.
-    slopes = np.maximum(np.abs(limits[0]), np.abs(limits[1]))
-    reach = 3.003 * sqrt(lens[0] ** 2 * (1 + slopes[0] ** 2) + lens[1] ** 2 * (1 + slopes[1] ** 2))
     for i in range(begin, end):
-        x, y, z, seen = _to_camera(camera, means, i)
-        centre_x, centre_y = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
-        most = reach * max(abs(scales[i, 0]), abs(scales[i, 1]), abs(scales[i, 2])) / z + 5
-        beyond = max(-centre_x, centre_x - size[0], -centre_y, centre_y - size[1]) > most
-        if not seen or beyond:  # all stays 0
+        x, y, z, in_range = _to_camera(camera, means, i)
+        if not in_range:
+            means2d[i], conics[i], covars2d[i] = 0, 0, 0
+            depths[i], compensations[i], radii[i] = 0, 0, 0
             continue
+        centre_x, centre_y = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
         _, _, _, _, _, xx, xy, yy, sharp_det, det = _footprint(camera, quats, scales, i, x, y, z, arrays)
         xx, yy = xx + BLUR, yy + BLUR
         means2d[i, 0], means2d[i, 1], depths[i] = centre_x, centre_y, z

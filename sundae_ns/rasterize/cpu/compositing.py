@@ -36,12 +36,13 @@ from sundae_ns.rasterize.cpu.lanes import (
     zeros,
 )
 from sundae_ns.rasterize.cpu.parallel import as_array, compiled, inlined, parallel_for
-from sundae_ns.rasterize.cpu.tiles import COLORS, HALF_XX, HALF_YY, MIN_PER_THREAD, OPACITY, TILE, XY, Lists, U, V
+from sundae_ns.rasterize.cpu.tiles import HALF_XX, HALF_YY, MIN_PER_THREAD, OPACITY, TILE, XY, Lists, U, V
 from sundae_ns.rasterize.reference import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 
 _PIXELS = TILE * TILE
 _CHECK_EVERY = 8  # list entries between two checks for opaque tiles
 _GATHERED = 16  # list entries whose numbers are read together
+_COLORS = OPACITY + 1  # first column of the colours among these numbers
 _FAINTEST = 20.0  # upper bound of negated exponents, far beyond log(255)
 _MIN_TILES = 8  # tiles that are worth another thread
 _GROUP = 4  # channels whose gradients are summed together: their sums stay in registers, also in those of AVX2
@@ -60,12 +61,12 @@ class _Composite(torch.autograd.Function):
         lists: Callable[[], Iterable[Lists]],
         absgrad: bool,
     ) -> tuple[Tensor, Tensor]:
-        (width, height), dtype = size, as_array(colors).dtype
+        (width, height), values = size, as_array(colors)
         tiles = -(-width // TILE) * -(-height // TILE)
-        image, alpha = (np.zeros((height, width, channels), dtype) for channels in (colors.shape[1], 1))
-        ends = np.empty((2, tiles, _PIXELS), dtype)
+        image, alpha = (np.zeros((height, width, channels), values.dtype) for channels in (values.shape[1], 1))
+        ends = np.empty((2, tiles, _PIXELS), values.dtype)
         for before, region in enumerate(lists()):
-            arguments = (tuple(region), image, alpha, *ends)
+            arguments = (tuple(region), values, image, alpha, *ends)
             parallel_for(_blend, len(region.longest_first), *arguments, min_per_thread=_MIN_TILES)
             ctx.lists = lists if before else [region].copy  # lists of several regions may exceed the memory
         ctx.save_for_backward(means2d, conics, opacities, colors)
@@ -77,14 +78,14 @@ class _Composite(torch.autograd.Function):
     def backward(ctx: Any, grad_image: Tensor, grad_alpha: Tensor) -> tuple[Tensor | None, ...]:
         means2d, _, _, colors = ctx.saved_tensors
         needs_geometry, needs_colors = any(ctx.needs_input_grad[:3]), ctx.needs_input_grad[3]
-        absgrad, dtype = ctx.absgrad and needs_geometry, ctx.ends.dtype
+        absgrad, values = ctx.absgrad and needs_geometry, as_array(colors)
         padded = -(-colors.shape[1] // _GROUP) * _GROUP
         gradients, needs = (as_array(grad_image), as_array(grad_alpha)), (needs_geometry, needs_colors, absgrad, padded)
-        outputs = tuple(np.zeros(value.shape, dtype) for value in ctx.saved_tensors)
-        absolute_grads = np.zeros(means2d.shape if absgrad else (0, 0, 0), dtype)
+        outputs = tuple(np.zeros(value.shape, values.dtype) for value in ctx.saved_tensors)
+        absolute_grads = np.zeros(means2d.shape if absgrad else (0, 0, 0), values.dtype)
         for region in ctx.lists():
-            parts = np.empty((len(region.ranks), padded + _MOMENTS * needs_geometry), dtype)
-            arguments = (tuple(region), ctx.ends, gradients, needs, parts)
+            parts = np.empty((len(region.ranks), padded + _MOMENTS * needs_geometry), values.dtype)
+            arguments = (tuple(region), (values, *ctx.ends), gradients, needs, parts)
             parallel_for(_blend_backward, len(region.longest_first), *arguments, min_per_thread=_MIN_TILES)
             summed = (tuple(region), parts, padded, outputs, absolute_grads)
             parallel_for(_sum_slots, len(region.ids), *summed, min_per_thread=MIN_PER_THREAD)
@@ -109,15 +110,17 @@ def _unclamped_alphas(dx: Any, dy: Any, row: Any) -> Any:
 
 
 @compiled
-def _blend(begin: int, end: int, lists: Any, image: Any, alpha_image: Any, transmittances: Any, last: Any) -> None:
-    columns, tiles, starts, ranks, _, spans, _, _, table = lists
+def _blend(
+    begin: int, end: int, lists: Any, colors: Any, image: Any, alpha_image: Any, transmittances: Any, last: Any
+) -> None:
+    columns, tiles, starts, ranks, _, spans, ids, _, table = lists
     number = table.dtype.type
     height, width, channels = image.shape
     x = load((np.arange(WIDTH) % TILE + 0.5).astype(table.dtype), 0)
     down = (np.arange(_PIXELS) // TILE + 0.5).astype(table.dtype)
     # Pixels are the fastest axis within a group of WIDTH, then channels.
     summed, blended = np.empty(_PIXELS, table.dtype), np.empty((_PIXELS // WIDTH, channels, WIDTH), table.dtype)
-    gathered = np.empty((_GATHERED, COLORS + channels), table.dtype)
+    gathered = np.empty((_GATHERED, _COLORS + channels), table.dtype)
     for k in range(begin, end):
         tile = tiles[k]
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
@@ -133,7 +136,7 @@ def _blend(begin: int, end: int, lists: Any, image: Any, alpha_image: Any, trans
         for entry in range(start, starts[tile + 1]):
             gathered_at = (entry - start) % _GATHERED
             if gathered_at == 0:
-                _gather(ranks, entry, starts[tile + 1], table, gathered)
+                _gather(ranks, entry, starts[tile + 1], table, ids, colors, gathered)
             row = gathered[gathered_at]
             dx, v = x - (row[U] - number(left)), row[V] - number(top)
             nth = entry - start + 1
@@ -150,7 +153,7 @@ def _blend(begin: int, end: int, lists: Any, image: Any, alpha_image: Any, trans
                 store(summed, p, load(summed, p) + weights)
                 for c in range(channels):
                     at = p * channels + c * WIDTH
-                    store(blended, at, fma(weights, broadcast(row, COLORS + c), load(blended, at)))
+                    store(blended, at, fma(weights, broadcast(row, _COLORS + c), load(blended, at)))
             if nth % _CHECK_EVERY == 0 and not _any_unfinished(through):
                 break
         through[:] = np.abs(through)
@@ -163,12 +166,14 @@ def _blend(begin: int, end: int, lists: Any, image: Any, alpha_image: Any, trans
 
 
 @inlined
-def _gather(ranks: Any, first: int, end: int, table: Any, gathered: Any) -> None:
+def _gather(ranks: Any, first: int, end: int, table: Any, ids: Any, colors: Any, gathered: Any) -> None:
     """Copy what the next entries of a list blend: the processor waits for all of these rows at once."""
     for k in range(min(end - first, len(gathered))):
         rank = ranks[first + k]
-        for column in range(gathered.shape[1]):
+        for column in range(_COLORS):
             gathered[k, column] = table[rank, column]
+        for c in range(colors.shape[1]):
+            gathered[k, _COLORS + c] = colors[ids[rank], c]
 
 
 @inlined
@@ -182,8 +187,8 @@ def _any_unfinished(through: Any) -> bool:
 @compiled
 def _blend_backward(begin: int, end: int, lists: Any, blended: Any, gradients: Any, needs: Any, parts: Any) -> None:
     """Write the gradients of channels, the moments of dL/de and the absolute gradient of the centre of each entry."""
-    columns, tiles, starts, ranks, _, spans, _, _, table = lists
-    transmittances, last = blended
+    columns, tiles, starts, ranks, _, spans, ids, _, table = lists
+    colors, transmittances, last = blended
     grad_image, grad_alpha = gradients
     needs_geometry, needs_colors, absgrad, padded = needs
     number = table.dtype.type
@@ -193,7 +198,7 @@ def _blend_backward(begin: int, end: int, lists: Any, blended: Any, gradients: A
     through, behind = np.empty(_PIXELS, table.dtype), np.empty(_PIXELS, table.dtype)
     weights, grads = np.empty(_PIXELS, table.dtype), np.zeros((_PIXELS // WIDTH, padded, WIDTH), table.dtype)
     alpha_grads = np.zeros(_PIXELS, table.dtype)
-    gathered = np.empty((_GATHERED, COLORS + channels * needs_geometry), table.dtype)
+    gathered = np.empty((_GATHERED, _COLORS + channels), table.dtype)
     for k in range(begin, end):
         tile = tiles[k]
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
@@ -213,7 +218,7 @@ def _blend_backward(begin: int, end: int, lists: Any, blended: Any, gradients: A
             entry = start + nth - 1
             gathered_at = (nth - 1) % _GATHERED
             if nth == deepest or gathered_at == _GATHERED - 1:
-                _gather(ranks, entry - gathered_at, entry + 1, table, gathered)
+                _gather(ranks, entry - gathered_at, entry + 1, table, ids, colors, gathered)
             row = gathered[gathered_at]
             dx, v = x - (row[U] - number(left)), row[V] - number(top)
             m = mx = my = mxx = mxy = myy = absolute_x = absolute_y = none
@@ -258,9 +263,9 @@ def _product(grads: Any, at: int, row: Any, channels: int) -> Any:
     """<g, c> of WIDTH pixels; two sums, whose latencies overlap."""
     even = odd = zeros(grads)
     for c in range(0, channels, 2):
-        even = fma(load(grads, at + c * WIDTH), broadcast(row, COLORS + c), even)
+        even = fma(load(grads, at + c * WIDTH), broadcast(row, _COLORS + c), even)
         if c + 1 < channels:
-            odd = fma(load(grads, at + c * WIDTH + WIDTH), broadcast(row, COLORS + c + 1), odd)
+            odd = fma(load(grads, at + c * WIDTH + WIDTH), broadcast(row, _COLORS + c + 1), odd)
     return even + odd
 
 

@@ -26,8 +26,8 @@ from sundae_ns.rasterize.types import check_pairs
 
 TILE = 8  # Side of a tile in pixels
 
-U, V, HALF_XX, XY, HALF_YY, OPACITY, LIMIT, HALF_WIDTH, HALF_HEIGHT, COLORS = range(10)
-"""Columns of the table: centre, conic, opacity, largest exponent that is blended and its distance, and the colours."""
+U, V, HALF_XX, XY, HALF_YY, OPACITY, LIMIT, HALF_WIDTH, HALF_HEIGHT = range(9)
+"""Columns of the table: centre, conic, opacity, largest exponent that is blended, and its distance from the centre."""
 
 STEP = WIDTH // TILE  # Rows of pixels of a tile that are blended in one step
 ROUNDING = 1e-3  # Slack on exponents, so that rounding never drops a Gaussian that is blended
@@ -48,27 +48,27 @@ class Lists(NamedTuple):
     spans: Any  # [L, 2], uint8, in list order: the steps of a tile that are touched, the last excluded
     ids: Any  # [V], int32: Gaussian of each rank
     first_slots: Any  # [V + 1], int64: first slot of each rank
-    table: Any  # [V, 9 + C]: see the column names above
+    table: Any  # [V, 9]: see the column names above
 
 
-def tile_lists(projection: Projection, opacities: Tensor, colors: Tensor, width: int, height: int) -> Iterator[Lists]:
-    """List the Gaussians of each tile; ``opacities`` ``[N]`` and ``colors`` ``[N, C]`` are those to blend.
+def tile_lists(projection: Projection, opacities: Tensor, width: int, height: int) -> Iterator[Lists]:
+    """List the Gaussians of each tile; ``opacities`` ``[N]`` are those to blend.
 
     An image with more than :data:`MOST_PAIRS` is halved until each region has fewer, or is a single tile. Without
     gradients one with more Gaussians than any real scene is a ``MemoryExhaustedError``.
     """
     columns, rows = -(-width // TILE), -(-height // TILE)
-    values = (projection.means2d, projection.covars2d, projection.conics, projection.radii, opacities, colors)
-    splats, depths = tuple(map(as_array, values)), as_array(projection.depths)
+    depths, radii, opacity = (as_array(value) for value in (projection.depths, projection.radii, opacities))
+    splats = (*map(as_array, (projection.means2d, projection.covars2d, projection.conics)), radii, opacity)
     # The bits of positive floats have the order of the floats.
     keys = depths.view(np.uint32 if depths.dtype == np.float32 else np.uint64)
-    ids = _visible_by_depth(keys, *splats[3:5])
+    ids = _visible_by_depth(keys, radii, opacity)
     count = len(ids)
     listed = 0
     regions = [(0, 0, columns, rows)]
     while regions:
         region = regions.pop()
-        table = np.empty((count, COLORS + colors.shape[1]), depths.dtype)
+        table = np.empty((count, 9), depths.dtype)
         boxes = np.empty((count, 4), np.int32)
         first_intervals, first_slots = np.zeros((2, count + 1), np.int64)
         parallel_for(_measure, count, ids, splats, region, table, boxes, first_intervals, min_per_thread=MIN_PER_THREAD)
@@ -133,7 +133,7 @@ def _visible_by_depth(keys: Any, radii: Any, opacities: Any) -> Any:
 @compiled
 def _measure(begin: int, end: int, ids: Any, splats: Any, region: Any, table: Any, boxes: Any, counts: Any) -> None:
     """Write a rank's row of the table and its rectangle of tiles in a region, and at rank + 1 its number of columns."""
-    means2d, covars2d, conics, radii, opacities, colors = splats
+    means2d, covars2d, conics, radii, opacities = splats
     number = table.dtype.type
     per_bin = BIN // TILE
     for rank in range(begin, end):
@@ -153,8 +153,6 @@ def _measure(begin: int, end: int, ids: Any, splats: Any, region: Any, table: An
         table[rank, HALF_XX], table[rank, HALF_YY] = number(0.5) * conics[i, 0], number(0.5) * conics[i, 2]
         table[rank, XY] = conics[i, 1]
         table[rank, OPACITY], table[rank, LIMIT] = opacities[i], reach
-        for c in range(colors.shape[1]):
-            table[rank, COLORS + c] = colors[i, c]
         if not finite:
             boxes[rank] = 0
         counts[rank + 1] = max(boxes[rank, 2] - boxes[rank, 0], 0)
