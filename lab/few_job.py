@@ -16,6 +16,6 @@ def few_job(capture: str, key: str, arm: str, method: str, steps: int, words: li
         parser = [*parser[:at], "filename", *parser[at + 3 :]]
     if words and words[0] == "--seed":
         seed, words = int(words[1]), words[2:]
-    options = ("--pipeline.model.evaluate-prune", "False", *words)
+    options = tuple(words) if method == "splatfacto" else ("--pipeline.model.evaluate-prune", "False", *words)
     name = f"{key}-{seed}"
     return Job(name, "whole", data.name, arm, str(data), method, steps, seed, options=options, parser=tuple(parser))

@@ -14,6 +14,10 @@ for c in .gpu/p*/scenes/*; do [ -d $c ] && mkdir -p /tmp/scenes && cp -r $c /tmp
 case $1 in
   setup)
     bash .gpu/setup.sh > /tmp/setup.log 2>&1; tail -n 1 /tmp/setup.log; python3 lab/console_scripts.py
+    # Processes of one GPU run side by side by MPS, if the machine has it; else they take turns.
+    export CUDA_MPS_PIPE_DIRECTORY=/tmp/mps CUDA_MPS_LOG_DIRECTORY=/tmp/mps; mkdir -p /tmp/mps
+    P='import torch; [print(float(torch.ones(9, device=f"cuda:{i}").sum())) for i in range(torch.cuda.device_count())]'
+    nvidia-cuda-mps-control -d && timeout 60 python3 -c "$P" && echo with MPS || { echo without MPS; tail /tmp/mps/*.log; echo quit | timeout 5 nvidia-cuda-mps-control; unset CUDA_MPS_PIPE_DIRECTORY CUDA_MPS_LOG_DIRECTORY; }
     mkdir -p $R $J /tmp/logs /tmp/out; cp -r benchmarks lab tests docs examples web *.md pyproject.toml Makefile mkdocs.yml method_configs $R/
     cp lab/slots.py /tmp/; (cd benchmarks; python3 -c 'import harness.job, sundae_ns.method_configs') || exit 3
     touch /tmp/logs/queue.log
