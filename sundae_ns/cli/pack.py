@@ -98,7 +98,7 @@ def pack(
         return 0
     print(f"{out}: {report.primitives:,} Gaussians in {report.bytes:,} bytes ({report.bytes / 1e6:.2f} MB)")
     print(f"{'':14}{'bytes':>12}{'bits per Gaussian':>20}")
-    for name, bits in {**report.bits, "all": 8 * report.bytes / report.primitives}.items():
+    for name, bits in report.bits.items():
         print(f"{name:14}{round(bits * report.primitives / 8):12,}{bits:20.2f}")
     if not figures:
         before.print_cost(out)

@@ -70,7 +70,6 @@ def newest_step(path: Path) -> int | None:
 def write(state: Mapping[str, Any], path: Path) -> None:
     """Write a checkpoint atomically; a ``StorageError`` names the newest older checkpoint that is whole."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         # Through a Python file, because torch's own writer hides the reason of a failed write.
         with replacing(path, path.with_name(_PARTIAL.format(os.getpid()))) as partial, partial.open("wb") as file:
             torch.save(_compact(dict(state)), file)
@@ -93,8 +92,6 @@ def _compact(value: Any) -> Any:
 
 def read(path: Path) -> dict[str, Any]:
     """A checkpoint of nerfstudio's trainer, on the CPU. No code in it runs; ``CheckpointError`` if it is bad."""
-    if not path.is_file():
-        raise CheckpointError(f"{path} does not exist; give a .ckpt file, or the folder of them")
     with reading(path, "a nerfstudio checkpoint", CheckpointError, remedy="give another file"), path.open("rb") as file:
         check_whole(file)
         return _loaded(file)
@@ -127,8 +124,8 @@ def read_newest(folder: Path) -> tuple[Path, dict[str, Any]]:
 def _open_newest(folder: Path) -> tuple[Path, BinaryIO, list[str]]:
     """As :func:`newest_whole`, with the open file, which stays readable after a training has removed it."""
     skipped: list[str] = []
-    before, listed = None, checkpoints(folder_of(folder))
-    while listed != before:  # else a training has replaced them since they were listed
+    before: list[Path] | None = None
+    while (listed := checkpoints(folder_of(folder))) != before:  # else a training has replaced them meanwhile
         skipped.clear()
         for path in reversed(listed):
             with ExitStack() as stack:
@@ -140,7 +137,7 @@ def _open_newest(folder: Path) -> tuple[Path, BinaryIO, list[str]]:
                 else:
                     stack.pop_all()
                     return path, file, skipped
-        before, listed = listed, checkpoints(folder_of(folder))
+        before = listed
     reasons = f" ({'; '.join(skipped)})" if skipped else ""
     raise CheckpointError(f"{folder} holds no whole checkpoint{reasons}; give the folder of a run that saved one")
 
@@ -192,14 +189,14 @@ def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor]) 
     counts = sorted({state[name].shape[0] for name in expected if name.startswith(_PREFIX)})
     if len(counts) != 1 or counts[0] == 0:
         raise CheckpointError(f"the checkpoint has parameters of {counts} Gaussians; give another")
-    (n,), running = counts, state[EXTRA_STATE]["running"]
+    running = state[EXTRA_STATE]["running"]
     pruning, densification = (running.get(name) for name in ("pruning", "densification"))
     numbers = [state[EXTRA_STATE].get("step"), *(pruning.values() if isinstance(pruning, Mapping) else [None])]
     if not all(isinstance(value, int) for value in numbers) or not isinstance(densification, Mapping):
         raise CheckpointError(_NO_CLOCK)
     for name, value in densification.items():
-        if isinstance(value, Tensor) and value.ndim > 0 and len(value) != n:
-            raise CheckpointError(f"{name} has {len(value)} rows in a checkpoint of {n} Gaussians; give another")
+        if isinstance(value, Tensor) and value.ndim > 0 and len(value) != counts[0]:
+            raise CheckpointError(f"{name} has {len(value)} rows, the checkpoint {counts[0]} Gaussians; give another")
 
 
 def gaussians_of(loaded: Mapping[str, Any], path: Path) -> Gaussians:

@@ -128,8 +128,9 @@ def up_of(path: Path, means: Tensor, marks: Marks) -> Direction:
 
 def usable(params: Mapping[str, Tensor], path: Path, failure: type[SundaeError] = CheckpointError) -> Sanitised:
     """The Gaussians of a file that have a meaning, with finite values; logs what was changed. None is a ``failure``."""
-    sanitised, n = sanitise(params), len(params["means"])
+    sanitised = sanitise(params)
     if not sanitised.gaussians.num_gaussians:
+        n = len(params["means"])
         raise failure(f"{path} has {n:,} Gaussians, and none is finite; export it again or give another")
     if summary := sanitised.summary():
         _log.warning("%s: %s", path, summary)
@@ -159,7 +160,8 @@ def read_gaussians(path: Path) -> tuple[dict[str, Tensor], bool]:
         from sundae_ns.io.pack.packed_scene import read_scene  # its decoder needs a compiler, which other files do not
 
         packed = read_scene(path)
-        model, params = packed.meta.get("model"), {name: packed.gaussians[name] for name in SPLAT_NAMES}
+        params = {name: packed.gaussians[name] for name in SPLAT_NAMES}
+        model = packed.meta.get("model")
         logits = isinstance(model, dict) and model.get("sh_degree") == 0
         gaussians = Gaussians(params, "logits" if logits else "harmonics").as_harmonics()
         return dict(gaussians), (packed.meta.get("source") or {}).get("model_frame") is not False
@@ -201,8 +203,8 @@ def _prepared(params: Mapping[str, Tensor], kind: str, marks: Marks, upright: bo
     gaussians = {name: value.detach().cpu() for name, value in sanitise(params).gaussians.as_harmonics().items()}
     if upright and kind != ".glb":
         gaussians = similarity(gaussians, UPRIGHT, 1.0)
-        turn, vectors = UPRIGHT[:, :3].double().numpy(), (marks.up or _MODEL_UP, marks.offset)
-        up, offset = (vector and tuple((turn @ vector).tolist()) for vector in vectors)
+        turn = UPRIGHT[:, :3].double().numpy()
+        up, offset = (vector and tuple((turn @ vector).tolist()) for vector in (marks.up or _MODEL_UP, marks.offset))
         marks = marks._replace(in_model_frame=False, up=up, offset=offset)
     if kind != ".ply":
         gaussians["features_rest"] = gaussians["features_rest"][:, : (MAX_SH_DEGREE + 1) ** 2 - 1]

@@ -183,7 +183,8 @@ def _primitives(document: Json, binary: memoryview) -> Iterator[tuple[Json, Tran
     for i, (node, _) in enumerate(visible):
         visit(node.get("children", []), i)
     transforms = _local_transforms([node for node, _ in visible]) if visible else np.empty((0, 4, 4))
-    by_mesh, instances = dict[int, list[Transforms]](), 0
+    by_mesh: dict[int, list[Transforms]] = {}
+    instances = 0
     for i, (node, parent) in enumerate(visible):
         transforms[i] = transforms[parent] @ transforms[i] if parent >= 0 else transforms[i]
         if "mesh" in node:

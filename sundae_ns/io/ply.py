@@ -105,9 +105,8 @@ def check_gaussians(params: Mapping[str, Tensor], failure: type[Exception] = Dat
 def checked(path: Path, params: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The parameters that .spz, .sog and .glb store, float32 on the CPU; quaternions become unit ones.
 
-    ``DataError`` for no Gaussians, values that are not finite, an SH degree above 3, or wrong shapes.
+    ``DataError`` for no Gaussians, values that are not finite, or an SH degree above 3.
     """
-    check_gaussians(params)
     gaussians = {name: params[name].detach().to("cpu", torch.float32).contiguous() for name in SPLAT_NAMES}
     if not len(gaussians["means"]):
         raise DataError(f"the scene has no Gaussians, which a {path.suffix} cannot store; check the run")
@@ -140,9 +139,8 @@ def write_ply(path: Path, params: Mapping[str, Tensor], *, comments: Sequence[st
 
     ``features`` are not written. Values that are not finite are written unchanged: drop such Gaussians first
     (``finite_mask``), because viewers do not. ``comments`` are lines for the header (:func:`comments_of`).
-    ``DataError`` for a missing parameter or a wrong shape; ``StorageError`` if the disk is full or not writable.
+    ``StorageError`` if the disk is full or not writable.
     """
-    check_gaussians(params)
     names, table = _table(params)
     names[3:3] = ("nx", "ny", "nz")
     table = np.insert(table, [3, 3, 3], 0, axis=1).astype("<f4", copy=False)
@@ -166,7 +164,8 @@ def keep_vertices(
     start, count, kind = file.elements["vertex"]
     if count != len(mask):
         raise DataError(f"{source} has {count} vertices, not {len(mask)}: it was changed meanwhile; run again.")
-    rows, header = np.asarray(file.rows()[mask.cpu().numpy()]), file.header
+    rows = np.asarray(file.rows()[mask.cpu().numpy()])
+    header = file.header
     if params is not None:
         names, table = _table(params)
         kept = {name: kind[name] for name in kind.names or () if name in names or not name.startswith("f_rest_")}
@@ -221,7 +220,8 @@ class _Ply:
                         columns.append((name, _LIST))
                     case ["property", kind, name]:
                         columns.append((name, "f8" if self.text and _TYPES[kind] == "f4" else order + _TYPES[kind]))
-            least, start = 0, len(self.header.splitlines()) if self.text else len(self.header)
+            least = 0  # bytes of all rows; a number of text has at least two with what follows it
+            start = len(self.header.splitlines()) if self.text else len(self.header)
             for name, (rows, columns) in stated.items():
                 if rows < 0 or (rows > 0 and not columns):
                     raise ValueError("an element has no properties, or a negative number of rows")
@@ -345,7 +345,8 @@ def read_ply(path: Path) -> dict[str, Tensor]:
         raise DataError(f"{path} has {rest} f_rest properties, which fit no SH degree; export it again.")
     params = {name: _columns(rows, names) for name, names in columns.items() if name != "means"}
     params["means"] = _columns(rows, columns["means"], np.result_type(np.float32, *(rows[x].dtype for x in "xyz")))
-    alphas, scales, wide = params["opacities"], params["scales"], (params["scales"] > 0).all()
+    alphas, scales = params["opacities"], params["scales"]
+    wide = (scales > 0).all()
     # No real scene has such logarithms and logits throughout.
     shares = ((alphas - 0.5).abs() <= 0.5).all() and (wide or alphas.max() - alphas.min() > 0.5)
     if len(rows) > 99 and (shares or (wide and scales.median() < 0.1)):

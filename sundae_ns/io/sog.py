@@ -204,7 +204,8 @@ def _finest_level(path: Path, entry: Entry, size: int) -> tuple[dict[str, Tensor
     if (version := meta.get("version", 1)) not in (1, "1"):
         raise DataError(f"{path} has version {version} of streamed SOG, this program reads 1; update it")
     files: dict[str, list[tuple[int, int]]] = {}  # offset and number of the rows of each leaf
-    nodes, names = [meta["tree"]], dict(enumerate(meta["filenames"]))  # no index counts from the end
+    names = dict(enumerate(meta["filenames"]))  # no index counts from the end
+    nodes = [meta["tree"]]
     while nodes:
         node = nodes.pop()
         nodes += node.get("children", ())
@@ -263,7 +264,8 @@ def _zip_entry(bundle: zipfile.ZipFile, size: int, folder: str, name: str) -> by
 
 def _decoded(file: Entry, meta: Mapping[str, Any], size: int) -> dict[str, Tensor]:
     """Gaussians from the files by their names, which have ``size`` bytes; the inverse of :func:`_encoded`."""
-    n, coefficients = int(meta["count"]), (int(meta["shN"]["bands"]) + 1) ** 2 - 1 if "shN" in meta else 0
+    n = int(meta["count"])
+    coefficients = (int(meta["shN"]["bands"]) + 1) ** 2 - 1 if "shN" in meta else 0
     afford_gaussians(n, coefficients, size)
 
     def pixels(entry: Mapping[str, Any], index: int, channels: int) -> NDArray[np.uint8]:
@@ -325,14 +327,14 @@ def codebook(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[
     # Start with half of the centres at quantiles and half spread evenly, for the few values at the ends.
     quantiles = np.quantile(ordered, (np.arange(128) + 0.5) / 128)
     centres = np.sort(np.concatenate([quantiles, np.linspace(ordered[0], ordered[-1], 128)]))
+    middles = partial(np.convolve, (0.5, 0.5), mode="valid")  # between neighbours
     for _ in range(30):
-        bounds = np.concatenate([[0], np.searchsorted(ordered, (centres[1:] + centres[:-1]) / 2), [len(ordered)]])
+        bounds = np.concatenate([[0], np.searchsorted(ordered, middles(centres)), [len(ordered)]])
         number = np.diff(bounds)
         # Sort again: rounding of the sums may swap neighbouring means.
         centres = np.sort(np.where(number > 0, np.diff(sums[bounds]) / np.maximum(number, 1), centres))
     numbers = centres.astype(np.float32)
-    stored = numbers.astype(np.float64)
-    return numbers, np.searchsorted((stored[1:] + stored[:-1]) / 2, values).astype(np.uint8)
+    return numbers, np.searchsorted(middles(numbers.astype(np.float64)), values).astype(np.uint8)
 
 
 def palette(rows: NDArray[np.float32], max_rows: int = MAX_PALETTE) -> tuple[NDArray[np.float32], NDArray[np.int64]]:

@@ -145,7 +145,8 @@ def _streams(content: bytes, sizes: list[int]) -> tuple[list[bytes], bytes]:
     from zstandard import ZstdDecompressor
 
     number, table = struct.unpack_from("<BI", content, 15)  # of streams, and the offset of their table
-    offset, parts = table + 16 * number, list[bytes]()
+    offset = table + 16 * number
+    parts: list[bytes] = []
     for i, size in enumerate(sizes):
         stored, unpacked = struct.unpack_from("<QQ", content, table + 16 * i)
         if number != len(sizes) or unpacked != size or offset + stored > len(content):

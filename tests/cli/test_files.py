@@ -21,7 +21,7 @@ from short_prunes import SHORT
 import sundae_ns as sn
 from sundae_ns.core.gaussians import SPLAT_NAMES
 from sundae_ns.io.formats import read_gaussian_file, write_for_viewers
-from sundae_ns.io.pack.packed_scene import PackedScene, read_scene, write_scene
+from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, read_scene, write_fitted
 from sundae_ns.io.ply import Marks, ply_marks, read_ply, write_ply
 from sundae_ns.scene import prune_scene as pruning
 from sundae_ns.scene.scene import from_points
@@ -39,7 +39,8 @@ def gaussians(n=200, features=0):
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
 def test_export_of_a_packed_scene(tmp_path, mode):
-    write_scene(tmp_path / "a.sundae", PackedScene(gaussians(), meta={"model": {**MODEL, "rasterize_mode": mode}}))
+    scene = PackedScene(gaussians(), meta={"model": {**MODEL, "rasterize_mode": mode}})
+    write_fitted(tmp_path / "a.sundae", *fit_scene(scene))
     assert run("export", tmp_path / "a.sundae", "-o", tmp_path / "a.ply") == 0
     found, truth = read_ply(tmp_path / "a.ply"), read_scene(tmp_path / "a.sundae").gaussians
     assert all(torch.equal(found[name], truth[name]) for name in SPLAT_NAMES)
@@ -52,7 +53,7 @@ def test_export_of_a_packed_scene(tmp_path, mode):
 
 @pytest.mark.usefixtures("short_distillation")
 def test_export_of_levels_of_detail(tmp_path, capsys):
-    write_scene(tmp_path / "a.sundae", PackedScene(gaussians(), meta={"model": MODEL}))
+    write_fitted(tmp_path / "a.sundae", *fit_scene(PackedScene(gaussians(), meta={"model": MODEL})))
     assert run("export", tmp_path / "a.sundae", "-o", tmp_path / "b", "--lod") == 0
     assert json.loads((tmp_path / "b" / "lod-meta.json").read_text())["counts"] == [200, 100, 50, 20]
     assert capsys.readouterr().out.count("dB against the full scene") == 3
@@ -125,7 +126,7 @@ print(json.dumps(codes))
 
 
 def test_commands_on_files_need_no_nerfstudio_and_a_prune_no_compiler(tmp_path):
-    write_scene(tmp_path / "a.sundae", PackedScene(gaussians(), meta={"model": MODEL}))
+    write_fitted(tmp_path / "a.sundae", *fit_scene(PackedScene(gaussians(), meta={"model": MODEL})))
     write_ply(tmp_path / "few.ply", gaussians(50))
     write_kind(tmp_path / "head.sundae", KINDS["residual"])
     commands = (

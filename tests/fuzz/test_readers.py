@@ -38,7 +38,7 @@ from sundae_ns.data.video import check_video, write_frames
 from sundae_ns.io import checkpoint
 from sundae_ns.io.formats import read_gaussian_file, read_gaussians, write_for_viewers, write_levels
 from sundae_ns.io.pack import container
-from sundae_ns.io.pack.packed_scene import PackedScene, read_scene, write_scene
+from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, read_scene, write_fitted
 from sundae_ns.io.ply import Marks, read_ply, read_point_cloud, write_ply
 from sundae_ns.plugin.dataparsers import LightNerfstudioParser, check_capture
 from sundae_ns.scene.scene import from_points
@@ -101,7 +101,7 @@ READERS = {
     "cloud.ply": (lambda path: write_cloud(path, text=False), read_cloud),
     "text.ply": (lambda path: write_cloud(path, text=True), read_cloud),
     "a.ckpt": (lambda path: write_checkpoint(path, small_field(20)), read_gaussians),
-    "a.sundae": (lambda path: write_scene(path, SCENE), unpack),
+    "a.sundae": (lambda path: write_fitted(path, *fit_scene(SCENE)), unpack),
     "page.html": (lambda path: sn.save(sn.Scene(Gaussians(small_field(20))), path), sn.load),
     "path.json": (write_path, sn.cameras_of),
     **{
@@ -198,7 +198,7 @@ def test_bombs_are_refused_before_they_unpack(stated, words, good, tmp_path):
 def test_a_few_constant_planes_cannot_fill_the_memory(tmp_path):
     """Every section is within its limit, but the field that they describe is not."""
     n, path = 80_000, tmp_path / "a.sundae"
-    write_scene(path, PackedScene({k: v[:1].expand(n, *v.shape[1:]) for k, v in SCENE.gaussians.items()}))
+    write_fitted(path, *fit_scene(PackedScene({k: v[:1].expand(n, *v.shape[1:]) for k, v in SCENE.gaussians.items()})))
     meta, body = header_and_body(path.read_bytes())
     padding = meta["sections"].pop()
     assert padding["name"] == "padding"
@@ -251,7 +251,7 @@ def a_checkpoint(path, place):
 def a_pack(path, place):
     """Write a packed scene that names ``place`` throughout its header, and as a section, which readers may refuse."""
     about = {"source": {"method": place}, "name": place, "model": {"sh_degree": 1}}
-    write_scene(path, PackedScene(small_field(20), meta=about))
+    write_fitted(path, *fit_scene(PackedScene(small_field(20), meta=about)))
     resection(path, place, container.read_sections(path, container.read_header(path))["means/low"])
 
 

@@ -24,7 +24,7 @@ from PIL import Image
 
 from sundae_ns.cli.view import serve
 from sundae_ns.io.pack import container
-from sundae_ns.io.pack.packed_scene import read_scene, write_scene
+from sundae_ns.io.pack.packed_scene import fit_scene, read_scene, write_fitted
 from sundae_ns.plugin.finished_runs import load_run
 from sundae_ns.scene.packing import contents_of, stated_start
 from sundae_ns.scene.page import page as page_of_scene
@@ -155,7 +155,7 @@ def capture(request, tmp_path):
     if request.param == "SCENE":
         given = os.environ.get("SUNDAE_BROWSER_SCENE")
         return Path(given) if given else pytest.skip("no scene was given (make browser SCENE=scene.sundae)")
-    write_scene(tmp_path / "tiny.sundae", contents_of(load_run(request.getfixturevalue("tiny").folder)))
+    write_fitted(tmp_path / "tiny.sundae", *fit_scene(contents_of(load_run(request.getfixturevalue("tiny").folder))))
     return tmp_path / "tiny.sundae"
 
 

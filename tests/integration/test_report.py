@@ -22,7 +22,7 @@ from PIL import Image
 import sundae_ns as sn
 from sundae_ns.core.errors import DataError
 from sundae_ns.io import checkpoint
-from sundae_ns.io.pack.packed_scene import write_scene
+from sundae_ns.io.pack.packed_scene import fit_scene, write_fitted
 from sundae_ns.plugin import finished_runs
 from sundae_ns.plugin.finished_runs import load_model, load_run
 from sundae_ns.report.measure import COLUMNS, Subject, measure
@@ -180,7 +180,7 @@ def test_a_run_that_cannot_be_opened_does_not_lose_the_others(tiny, tmp_path, ca
 
 def test_a_packed_scene_counts_the_bytes_of_its_file(report, tiny, tmp_path, capsys):
     packed = tmp_path / "tiny.sundae"
-    write_scene(packed, contents_of(load_run(tiny.folder)))
+    write_fitted(packed, *fit_scene(contents_of(load_run(tiny.folder))))
     words = ("compare", packed, "-o", tmp_path / "out", "--repeats", 0)
     assert run(*words) == 2
     assert "give another, --formats, or --data with a capture" in one_line(capsys)

@@ -3,7 +3,7 @@
 import pytest
 from chromium import bench_viewers, needs_chromium, needs_packages
 
-from sundae_ns.io.pack.packed_scene import write_scene
+from sundae_ns.io.pack.packed_scene import fit_scene, write_fitted
 from sundae_ns.plugin.finished_runs import load_run
 from sundae_ns.scene.packing import contents_of
 
@@ -23,7 +23,7 @@ A .spz rounds everything; GaussianSplats3D rounds base colours to bytes, and doe
 
 @pytest.mark.parametrize("kind", ["ply", "spz", "sog", "glb", "lod"])
 def test_viewers_agree_with_python(kind, tiny, tmp_path):
-    write_scene(tmp_path / "a.sundae", contents_of(load_run(tiny.folder)))
+    write_fitted(tmp_path / "a.sundae", *fit_scene(contents_of(load_run(tiny.folder))))
     rows = list(bench_viewers.rows(tmp_path / "a.sundae", kind=kind, center=True))
     found = {(row["viewer"], kind): row["psnr_of_all"] for row in rows}
     assert found.keys() == {name for name in LEAST if name[1] == kind}

@@ -19,7 +19,7 @@ from sundae_ns.core.errors import CheckpointError, DataError
 from sundae_ns.core.gaussians import SPLAT_NAMES, Gaussians, bytes_of, sh_degree
 from sundae_ns.head.head import bytes_of_module
 from sundae_ns.io.formats import kind_of, read_gaussian_file, read_gaussians, refuse, write_for_viewers, write_levels
-from sundae_ns.io.pack.packed_scene import PackedScene, write_scene
+from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, write_fitted
 from sundae_ns.io.ply import Marks, keep_vertices, read_ply, read_point_cloud, write_ply
 from sundae_ns.io.spz import fractional_bits
 
@@ -213,7 +213,7 @@ def test_values_beyond_the_range_of_a_spz_are_named(tmp_path, caplog):
 
 
 def test_kinds_follow_from_first_bytes(tmp_path):
-    write_scene(tmp_path / "packed.ply", PackedScene(small_field(4)))
+    write_fitted(tmp_path / "packed.ply", *fit_scene(PackedScene(small_field(4))))
     write_ply(tmp_path / "points.sundae", small_field(4))
     for name, content in {"dos.txt": b"ply\r\nformat", "word.ply": b"plywood", "empty.sundae": b""}.items():
         (tmp_path / name).write_bytes(content)

@@ -20,7 +20,7 @@ from sundae_ns.head.head import CompensationHead, HeadConfig
 from sundae_ns.io.pack import container
 from sundae_ns.io.pack.codecs import Sensitivity
 from sundae_ns.io.pack.config import PackConfig
-from sundae_ns.io.pack.packed_scene import PackedScene, write_scene
+from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, write_fitted
 from sundae_ns.scene.load_save import load
 from sundae_ns.scene.packing import contents_of
 from sundae_ns.scene.scene import Background, Scene, from_points, initial_features
@@ -95,7 +95,7 @@ def write_kind(path: Path, kind: Kind) -> Path:
     encoded = Gaussians(gaussians, "harmonics" if kind.degree else "logits")
     packed = contents_of(Scene(encoded, head, kind.background, kind.antialiased, focal, in_model_frame=True))
     sensitivity = _sensitivity(gaussians, packed.head) if kind.measured else None
-    write_scene(path, replace(packed, cameras=_cameras(), sensitivity=sensitivity), kind.config)
+    write_fitted(path, *fit_scene(replace(packed, cameras=_cameras(), sensitivity=sensitivity), kind.config))
     return path
 
 
@@ -118,7 +118,7 @@ def write_bomb(path: Path, count: int = 20_000) -> Path:
     lens = torch.tensor([300.0, 300.0, 160.0, 120.0]).double().repeat(2, 1)
     cameras = {"poses": poses, "intrinsics": lens, "sizes": torch.tensor([[320, 240]]).repeat(2, 1)}
     model = {"sh_degree": 1, "rasterize_mode": "classic", "background_color": "white", "head": None}
-    write_scene(path, PackedScene(gaussians, {}, cameras, {"model": model}))
+    write_fitted(path, *fit_scene(PackedScene(gaussians, {}, cameras, {"model": model})))
     return path
 
 

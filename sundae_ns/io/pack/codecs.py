@@ -366,9 +366,9 @@ class Codecs:
             codecs[name] = Rotations(step)
             if isinstance(codec, Transform):
                 codecs[name] = codec.with_step(step, as_matrix(gaussians[name]))
-        kept = {"position_bits": self.config.position_bits, "block": self.config.block}
+        config = replace(config, position_bits=self.config.position_bits, block=self.config.block)
         of_head = None if self.head is None else self.head.scaled(ratios["head_step"], head)
-        return Codecs(replace(config, **kept), self.blocks, codecs, of_head)  # type: ignore[arg-type]
+        return Codecs(config, self.blocks, codecs, of_head)
 
     @torch.no_grad()
     def rounded(self, gaussians: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -403,14 +403,14 @@ def fit_codecs(
     values["means"] = blocks.positions(config.position_bits, config.block)
     values["quats"], values["scales"] = aligned(values["quats"], values["scales"])
     values["opacities"] = values["opacities"].clip(*_LOGITS)
-    seen = sensitivity or Sensitivity({}, {})
+    sensitivity = sensitivity or Sensitivity({}, {})
     codecs: dict[str, Rotations | Transform] = {"quats": Rotations(config.rotation_step)}
     for name, option in _STEPS.items():
         if name != "quats" and name in values and values[name].size:
-            step, form = getattr(config, option), seen.rows.get(name)
+            step, form = getattr(config, option), sensitivity.rows.get(name)
             codecs[name] = fit_transform(values[name], step, centred=name != "features_rest", form=form)
     ordered = {name: torch.from_numpy(values[name]).reshape(gaussians[name].shape) for name in names}
-    return ordered, Codecs(config, blocks, codecs, _fit_head(head, config.head_step, seen.head))
+    return ordered, Codecs(config, blocks, codecs, _fit_head(head, config.head_step, sensitivity.head))
 
 
 def _fit_head(head: Mapping[str, Tensor], share: float, sensitivity: Mapping[str, Tensor]) -> HeadCodec | None:
@@ -428,7 +428,8 @@ def _fit_head(head: Mapping[str, Tensor], share: float, sensitivity: Mapping[str
     for name, value in weights.items():
         # All of a layer's derivatives are zero where a later layer is, as in a head that was enabled just now.
         least = max(1e-3 * float(sensitivity[name].mean()), 1e-9 * mean)
-        loss, count = sensitivity[name].clamp_min(least), value[0, 0].numel()
+        loss = sensitivity[name].clamp_min(least)
+        count = value[0, 0].numel()  # weights of a pair of channels
         target += count * float((loss * rows[name].double()[:, None] ** 2).sum())
         row, column = loss.mean(dim=1), loss.mean(dim=0) / loss.mean()
         rows[name], columns[name] = (_quarters(side.rsqrt()) for side in (row, column))

@@ -45,7 +45,7 @@ class PackedScene:
 
 
 class PackReport(NamedTuple):
-    """Bytes of a packed scene, of each of its sections, and of ``header``."""
+    """Bytes of a packed scene, of each of its sections, and of its ``header``."""
 
     primitives: int
     bytes: int
@@ -53,17 +53,16 @@ class PackReport(NamedTuple):
 
     @property
     def bits(self) -> dict[str, float]:
-        """Bits per Gaussian of each attribute, and of ``head``, ``cameras`` and ``header``."""
+        """Bits per Gaussian of each attribute, of ``head``, ``cameras`` and ``header``, and of ``all``."""
         sums = Counter[str]()
         for name, count in self.sections.items():
             sums[name.partition("/")[0]] += count
-        return {name: 8 * count / self.primitives for name, count in sums.items()}
+        return {name: 8 * count / self.primitives for name, count in {**sums, "all": self.bytes}.items()}
 
     def summary(self) -> dict[str, Any]:
-        """JSON values: Gaussians, bytes, and the bits per Gaussian of each attribute and of all."""
-        bits = {**self.bits, "all": 8 * self.bytes / self.primitives}
-        rounded = {name: round(count, 2) for name, count in bits.items()}
-        return {"primitives": self.primitives, "bytes": self.bytes, "bits": rounded}
+        """JSON values: Gaussians, bytes, and the bits per Gaussian."""
+        bits = {name: round(count, 2) for name, count in self.bits.items()}
+        return {"primitives": self.primitives, "bytes": self.bytes, "bits": bits}
 
 
 def _check(params: Mapping[str, Tensor]) -> None:
@@ -88,11 +87,6 @@ def fit_scene(scene: PackedScene, config: PackConfig | None = None) -> tuple[Pac
     _check(scene.gaussians)
     gaussians, codecs = fit_codecs(scene.gaussians, scene.head, config, scene.sensitivity)
     return replace(scene, gaussians=gaussians), codecs
-
-
-def write_scene(path: Path, scene: PackedScene, config: PackConfig | None = None) -> PackReport:
-    """Pack a scene into one file: :func:`fit_scene`, then :func:`write_fitted`."""
-    return write_fitted(path, *fit_scene(scene, config))
 
 
 def write_fitted(path: Path, scene: PackedScene, codecs: Codecs) -> PackReport:
@@ -164,7 +158,8 @@ def _about(file: _Sections, attribute: str) -> dict[str, Any]:
 def _array(file: _Sections, attribute: str, part: str, **lengths: int) -> Array:
     """A section in the dtype, shape and range that the format states; ``lengths`` are sides that it names."""
     codec = attribute if attribute == "cameras" else _about(file, attribute)["codec"]
-    section, name = FORMAT["sections"][codec][part], f"{attribute}/{part}"
+    section = FORMAT["sections"][codec][part]
+    name = f"{attribute}/{part}"
     if (array := file.arrays.get(name)) is None or not fits(array, section, lengths):
         raise ValueError(f"{name} is missing or has another shape")
     if not in_range(array, section):

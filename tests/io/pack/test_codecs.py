@@ -18,7 +18,7 @@ from sundae_ns.io.pack import codecs as module
 from sundae_ns.io.pack import entropy
 from sundae_ns.io.pack.codecs import HeadCodec, Sensitivity, estimated_bits
 from sundae_ns.io.pack.config import PackConfig
-from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, read_scene, write_fitted, write_scene
+from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, read_scene, write_fitted
 
 hard = given(st.sampled_from(KINDS), st.integers(1, 700), st.integers(0, 2**16))
 less_hard = given(st.sampled_from(KINDS[:5]), st.integers(1, 500), st.integers(0, 2**16))
@@ -314,7 +314,7 @@ def test_a_head_that_does_nothing_yet_is_packed(tmp_path, seen):
     gaussians = random_field(50)
     forms = {"features": torch.zeros(2 * gaussians["features"].shape[1:], dtype=torch.float64)}
     scene = PackedScene(gaussians, head, sensitivity=Sensitivity(forms, shown))
-    write_scene(tmp_path / "a.sundae", scene, PackConfig(head_step=0.02))
+    write_fitted(tmp_path / "a.sundae", *fit_scene(scene, PackConfig(head_step=0.02)))
     found = read_scene(tmp_path / "a.sundae")
     assert (found.gaussians["features"].std(dim=0) > 0).all()
     for name, value in head.items():

@@ -16,7 +16,7 @@ from sundae_ns.core.gaussians import MAX_SH_DEGREE
 from sundae_ns.head.head import HeadConfig
 from sundae_ns.io.pack import container
 from sundae_ns.io.pack.container import FORMAT, LIMITS, fault, parsed
-from sundae_ns.io.pack.packed_scene import read_scene, write_scene
+from sundae_ns.io.pack.packed_scene import fit_scene, read_scene, write_fitted
 from sundae_ns.scene.scene import Background
 
 SCHEMAS = ("container", "header", "model")
@@ -145,7 +145,7 @@ SECTIONS = {
 
 @pytest.fixture
 def path(tmp_path):
-    write_scene(tmp_path / "a.sundae", full_scene(40, 1, 3))
+    write_fitted(tmp_path / "a.sundae", *fit_scene(full_scene(40, 1, 3)))
     return tmp_path / "a.sundae"
 
 
