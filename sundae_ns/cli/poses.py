@@ -71,14 +71,14 @@ def check_poses(photos: Path, options: PoseOptions, *, remarks: bool = True) -> 
 
     check_installed()
     check_least(frames=(options.frames, LEAST_PHOTOS))
+    warn: Callable[[str], object] = _warn if remarks else str
     if is_video(photos):
         if options.masks is not None:
             raise ConfigError("a video has no masks; leave out --masks")
-        check_video(photos)
+        check_video(photos, warn)
         return None
     if not photos.is_dir():
         raise DataError(f"{photos} is neither a folder of photos nor a video ({', '.join(SUFFIXES)})")
-    warn: Callable[[str], object] = _warn if remarks else str
     files = find_photos(photos, warn)
     if (remark := left_out(photos)) is not None:
         warn(remark)

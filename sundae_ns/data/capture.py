@@ -8,7 +8,6 @@ import unicodedata
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +43,7 @@ def matrix(value: Any, rows: Sequence[int], name: str, where: str) -> np.ndarray
     listed = isinstance(value, list) and len(value) in rows
     if not listed or not all(isinstance(row, list) and len(row) == 4 for row in value):
         raise DataError(f"{where}: {name} must have {' or '.join(map(str, rows))} rows of 4 numbers; correct the file")
-    for entry in chain(*value):
+    for entry in sum(value, []):
         finite(entry, name, where)
     array = np.array(value, np.float64)
     if abs(np.linalg.det(array[:3, :3])) < 1e-9:

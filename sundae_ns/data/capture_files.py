@@ -164,8 +164,7 @@ def transforms_of(model: Any, sources: Mapping[str, str], *, masked: bool = Fals
             **({} if len(shared) == 1 else cameras[posed[name].camera_id]),
             "transform_matrix": _pose(np.asarray(posed[name].cam_from_world().matrix())).tolist(),
         }
-        for name in names
-        if name in posed
+        for name in filter(posed.__contains__, names)
     ]
     return {
         "camera_model": "OPENCV",
@@ -186,9 +185,8 @@ def _intrinsics(camera: Any) -> dict[str, float]:
 
 def _pose(camera_from_world: np.ndarray) -> np.ndarray:
     """Camera-to-world ``[4, 4]`` with OpenGL axes, in the capture's coordinates, of COLMAP's pose ``[3, 4]``."""
-    bottom = [0.0, 0.0, 0.0, 1.0]
-    pose = np.linalg.inv([*camera_from_world, bottom]) * (*OPENGL_TO_OPENCV, 1.0)
-    return np.array([*(APPLIED[:, :3] @ pose[:3]), bottom])
+    pose = np.linalg.inv([*camera_from_world, (0, 0, 0, 1)]) * (*OPENGL_TO_OPENCV, 1.0)
+    return np.array([*(APPLIED[:, :3] @ pose[:3]), (0, 0, 0, 1)])
 
 
 def write_demo_capture(out: Path) -> Path:

@@ -103,8 +103,8 @@ def read_points(model: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
                 starts.append(end)
                 end += _POINT.itemsize
                 end += 8 * _COUNT.unpack_from(content, end - _COUNT.size)[0]
-            if end > len(content):
-                raise ValueError(f"it ends {end - len(content):,} bytes early")
+            if end != len(content):
+                raise ValueError(f"its entries take {end:,} bytes, it has {len(content):,}")
             windows = sliding_window_view(np.frombuffer(content + bytes(_POINT.itemsize), np.uint8), _POINT.itemsize)
             points = windows[starts].view(_POINT)[:, 0]
             return points["xyz"].copy(), points["rgb"].copy()
@@ -161,9 +161,9 @@ def _images(content: bytes, text: bool) -> Iterator[tuple[int, tuple[float, ...]
         start = at + _IMAGE.size
         end = content.index(b"\0", start, start + 4096)
         at = end + 1 + _COUNT.size + 24 * _COUNT.unpack_from(content, end + 1)[0]
-        if at > len(content):
-            raise ValueError(f"it ends {at - len(content):,} bytes early")
         yield number, tuple(pose), camera, content[start:end].decode("utf-8")
+    if at != len(content):
+        raise ValueError(f"its entries take {at:,} bytes, it has {len(content):,}")
 
 
 def _rows(content: bytes, *, images: bool = False) -> list[list[str]]:

@@ -29,9 +29,10 @@ _TURN = "orientation of a TIFF"
 _MODES = {"CMYK": "CMYK", **dict.fromkeys(("1", "L", "LA", "I;16", "I;16B", "I;16L"), "L")}
 _MODES |= dict.fromkeys(("P", "PA", "RGB", "RGBA", "YCbCr"), "RGB")
 HIGH_RANGE = PQ, HLG = 16, 18  # transfers
-# Chromaticities of red, green and blue, of BT.709 and sRGB, of BT.2020 and of Display P3; white is D65.
+# Chromaticities of red, green and blue beside a white of D65, to which Bradford's matrix adapts that of DCI-P3 (11).
 _SRGB = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06)
 PRIMARIES = {9: (0.708, 0.292, 0.170, 0.797, 0.131, 0.046), 12: (0.680, 0.320, 0.265, 0.690, 0.150, 0.060)}
+PRIMARIES[11] = (0.6807, 0.3189, 0.2812, 0.6742, 0.1488, 0.0577)
 _ADOBE = 563 / 256, (0.64, 0.33, 0.21, 0.71, 0.15, 0.06)  # Adobe RGB (1998), an exponent and primaries
 _WHITE = 203.0  # cd/m2, of a white sheet (Report ITU-R BT.2408); HLG is for a display of 1,000
 _KNEE = 0.46  # share of white from which a high range is rolled off

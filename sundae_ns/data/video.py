@@ -14,14 +14,12 @@ from PIL import Image
 
 from sundae_ns.core.errors import DataError, reading, regular, writing
 from sundae_ns.data.images import HIGH_RANGE, JPEG, PRIMARIES, to_srgb_values
-from sundae_ns.data.photos import LEAST_PHOTOS, check_shape
+from sundae_ns.data.photos import LEAST_PHOTOS, Warn, check_shape
 
 SUFFIXES = tuple(".mp4 .mov .m4v .avi .mkv .webm .mpg .mpeg .mts .m2ts .ts .3gp .wmv .flv .ogv".split())
-_OPTIONS = {
-    # Formats that open no other file: a playlist would take frames of other videos of this machine.
-    "format_whitelist": "mov,matroska,avi,mpeg,mpegvideo,mpegts,h264,hevc,flv,asf,ogg",
-    "protocol_whitelist": "file",
-}
+# Formats that open no other file: a playlist would take frames of other videos of this machine.
+_FORMATS = "mov,matroska,avi,mpeg,mpegvideo,mpegts,h264,hevc,flv,asf,ogg"
+_OPTIONS = {"format_whitelist": _FORMATS, "protocol_whitelist": "file"}
 _CONVERT = "convert it to .mp4 (H.264)"
 # Numbers of ITU-T H.273: matrices of BT.709, FCC, BT.601 (twice), 240M, BT.2020; of RGB or unknown; transfers refused.
 _MATRICES, _UNSTATED = (1, 4, 5, 6, 7, 9), (0, 2, 3)
@@ -36,19 +34,21 @@ def is_video(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() in SUFFIXES
 
 
-def check_video(path: Path) -> None:
+def check_video(path: Path, warn: Warn = str) -> None:
     """Raise ``DataError`` if a video cannot be decoded, has too few frames, or colours that cannot be converted."""
-    (length, aspect), first = _facts(path), next(_frames(path), None)
+    (length, aspect, tracks), first = _facts(path), next(_frames(path), None)
     if first is None:
         raise DataError(f"{path} has no frame that can be decoded; {_CONVERT}")
     if length < LEAST_PHOTOS:
         raise DataError(f"{path} has {length} frames, and camera poses need {LEAST_PHOTOS} or more; give a longer one")
+    if tracks > 1:
+        warn(f"{path} has {tracks} video tracks; that of {first.width} x {first.height} px is read")
     check_shape(path, image_of(first, path, aspect).size)
 
 
 def write_frames(path: Path, folder: Path, count: int, advance: Callable[[int], None]) -> None:
     """Write the sharpest frame of each of ``count`` stretches of a video to a folder, which appears at the end."""
-    partial, written, (length, aspect) = folder.with_name(f"{folder.name}.partial"), 0, _facts(path)
+    partial, written, (length, aspect, _) = folder.with_name(f"{folder.name}.partial"), 0, _facts(path)
     with writing(f"cannot write {folder}"):
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
@@ -89,21 +89,23 @@ def image_of(frame: Any, path: Path, aspect: float = 1.0) -> Image.Image:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
-    """The container and its video."""
+def _opened(path: Path) -> Iterator[tuple[Any, list[Any]]]:
+    """The container and its videos, the one to read first."""
     import av
 
     with reading(path, "a video that FFmpeg decodes", remedy=_CONVERT, missing=_CONVERT):
         # Titles of old files are not in UTF-8.
         with av.open(str(regular(path).absolute()), options=_OPTIONS, metadata_errors="replace") as container:
-            video: Any = container.streams.best("video")
-            if video is None or video.codec_context is None:
+            # Beside a video there may be a cover (disposition 1024) or a preview, often as JPEG.
+            videos: Any = [v for v in container.streams.video if v.codec_context and v.disposition.value != 1024]
+            videos.sort(key=lambda v: (v.name != "mjpeg", v.width * v.height), reverse=True)
+            if not videos:
                 raise DataError(f"{path} has no images that can be decoded; {_CONVERT}")
-            if video.codec_context.codec_tag in _DOLBY and video.codec_context.color_trc in _UNSTATED:
+            if (coder := videos[0].codec_context).codec_tag in _DOLBY and coder.color_trc in _UNSTATED:
                 raise DataError(f"{path} has colours of Dolby Vision alone, which are not read; convert it to BT.709")
-            video.thread_type = "AUTO"
-            video.codec_context.options = {"max_pixels": str(1 << 27)}
-            yield container, video
+            coder.thread_type = "AUTO"
+            coder.options = {"max_pixels": str(1 << 27)}
+            yield container, videos
 
 
 def _frames(path: Path) -> Iterator[Any]:
@@ -118,7 +120,7 @@ def _frames(path: Path) -> Iterator[Any]:
             while True:
                 yield graph.pull()
 
-    with _opened(path) as (container, video):
+    with _opened(path) as (container, (video, *_)):
         for packet in container.demux(video):
             frames = []
             with suppress(av.error.InvalidDataError):  # the packet is damaged
@@ -133,12 +135,12 @@ def _frames(path: Path) -> Iterator[Any]:
             yield from filtered(None)
 
 
-def _facts(path: Path) -> tuple[int, float]:
-    """Number of frames, which files state wrongly; and width of a pixel as a share of its height."""
-    with _opened(path) as (container, video):
+def _facts(path: Path) -> tuple[int, float, int]:
+    """Number of frames, which files state wrongly; width of a pixel as a share of its height; number of tracks."""
+    with _opened(path) as (container, (video, *others)):
         aspect = float(video.sample_aspect_ratio or 1)
         length = sum(packet.size > 0 and not packet.is_discard for packet in container.demux(video))
-    return length, aspect if 0.5 <= aspect <= 2 else 1.0  # no format of videos uses others
+    return length, aspect if 0.5 <= aspect <= 2 else 1.0, 1 + len(others)  # no format of videos uses other aspects
 
 
 def _sharpest(path: Path, count: int, length: int) -> Iterator[Any]:

@@ -44,24 +44,20 @@ def _named(name: str, node: yaml.Node) -> Any:
             value = getattr(importlib.import_module(module), attribute, None)
     home = str(getattr(value, "__module__", "")).partition(".")[0]
     if home not in _trusted_packages() or not isinstance(value, (type, FunctionType)):
-        raise _refused(f"it names {name}", node)
+        raise ConstructorError(None, None, f"it names {name}", node.start_mark)
     return value
-
-
-def _refused(reason: str, node: yaml.Node) -> ConstructorError:
-    return ConstructorError(None, None, reason, node.start_mark)
 
 
 def _make_object(loader: _ConfigLoader, suffix: str, node: yaml.Node) -> Iterator[Any]:
     kind = _named(suffix, node)
     if not isinstance(kind, type) or not dataclasses.is_dataclass(kind) or not isinstance(node, yaml.MappingNode):
-        raise _refused(f"{suffix} is no configuration", node)
+        raise ConstructorError(None, None, f"{suffix} is no configuration", node.start_mark)
     made = kind.__new__(kind)
     yield made
     state = loader.construct_mapping(node, deep=True)
     # Setting a configuration up calls its target.
     if not isinstance(state.get("_target", type), type):
-        raise _refused(f"the target of {suffix} is no class", node)
+        raise ConstructorError(None, None, f"the target of {suffix} is no class", node.start_mark)
     for option in dataclasses.fields(kind):  # options newer than the run
         if option.name not in state and option.default_factory is not dataclasses.MISSING:
             state[option.name] = option.default_factory()
@@ -77,7 +73,7 @@ def _make_value(loader: _ConfigLoader, suffix: str, node: yaml.Node) -> Any:
     by_name = suffix == "builtins.getattr"  # as Python before 3.11.4 saves a member of an enumeration
     kind, *value = arguments if by_name and arguments else (_named(suffix, node), *arguments)
     if not isinstance(kind, type) or not issubclass(kind, Enum) or len(value) != 1:
-        raise _refused(f"it asks to call {suffix}", node)
+        raise ConstructorError(None, None, f"it asks to call {suffix}", node.start_mark)
     return kind.__members__[value[0]] if by_name else kind(value[0])
 
 

@@ -72,14 +72,16 @@ _MARKS = [
 ]
 ANTIALIASED = "mip mipsplatting antialiased antialiasing 1 1.0 true yes on enabled".split()  # values of a mark
 _FOREIGN = {
+    r"f_anchor_feat_\d+|f_offset_\d+|(?!f_dc_|f_rest_|features?_(?:dc|rest))\w*(?:feat|embed|latent|hash)\w*|f_\d+": (
+        "needs a network for its colours ({}), as Scaffold-GS does; export it as 3D Gaussians with SH colours"
+    ),
+    r"(?:[frgb]_?)?(?:shs?|harmonics?)_?(?:n|rest|dc|coef\w*?)?_?\d\w*|features?_(?:dc|rest)\w*|"
+    r"(?:sh_?)?rest_?\d+": "has harmonics by other names ({}); export them as f_dc_0, ... and f_rest_0, ...",
     r"(?:beta|shape|kernel|nu)s?(?:_\w+)?|sb_params_\d+": "holds Gaussians of another kernel ({}); export 3D Gaussians",
     r"trbf_\w+|motion_\d+|omega_\d+|t|time\w*|(?:\w+_|m)t|t_(?:center|scale|mu)|rot\w*_r_\d|scale_3|velocity\w*|duration|"
     r"delta_vertex_\w*": "holds 4D Gaussians ({}), which move; export one moment of it as 3D Gaussians",
-    r"f_anchor_feat_\d+|f_offset_\d+|(?!f_dc_|f_rest_)\w*(?:feat|embed|latent|hash)\w*|f_\d+": (
-        "needs a network for its colours ({}), as Scaffold-GS does; export it as 3D Gaussians with SH colours"
-    ),
 }
-"""Names of elements and properties in scenes of other kinds, and the remedy; the last where there are no colours."""
+"""Names of elements and properties in scenes of other kinds, and the remedy; the first where there are no colours."""
 
 
 class Marks(NamedTuple):
@@ -329,7 +331,7 @@ def read_ply(path: Path) -> dict[str, Tensor]:
     if present.issuperset(_RGB) and not present & set(_COLUMNS["features_dc"]):
         columns["features_dc"] = _RGB
     missing = [name for names in columns.values() for name in names if name not in present]
-    for pattern, reason in list(_FOREIGN.items())[: None if set(columns["features_dc"]) & set(missing) else -1]:
+    for pattern, reason in list(_FOREIGN.items())[0 if set(columns["features_dc"]) & set(missing) else 1 :]:
         if known := sorted(name for name in present.union(file.elements) if re.fullmatch(pattern, name)):
             raise DataError(f"{path} {reason.format(known[0])}")
     is_flat = missing == ["scale_2"]  # 2D Gaussians
@@ -347,9 +349,10 @@ def read_ply(path: Path) -> dict[str, Tensor]:
     params["means"] = _columns(rows, columns["means"], np.result_type(np.float32, *(rows[x].dtype for x in "xyz")))
     alphas, scales = params["opacities"], params["scales"]
     wide = (scales > 0).all()
-    # No real scene has such logarithms and logits throughout.
+    # No real scene has such logarithms and logits throughout: their logarithms reach as far below the median as above.
     shares = ((alphas - 0.5).abs() <= 0.5).all() and (wide or alphas.max() - alphas.min() > 0.5)
-    if len(rows) > 99 and (shares or (wide and scales.median() < 0.1)):
+    low, middle, high = np.percentile(scales, (1, 50, 99)) if wide and len(rows) > 99 else (0, 1, 1)
+    if len(rows) > 99 and (shares or middle < 0.1 or high - middle > 5 * (middle - low)):
         raise DataError(f"{path} has widths and opacities, not their logarithms and logits; export it again.")
     if is_flat:
         params["scales"] = torch.nn.functional.pad(params["scales"], (0, 1), value=-math.inf)

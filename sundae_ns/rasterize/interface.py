@@ -215,8 +215,7 @@ def numba_problem() -> str | None:
     except ImportError as error:
         return f"numba does not import ({one_line(error)}); pip install numba"
     except Exception as error:  # versions, processors and settings that numba refuses raise errors of many kinds
-        remedy = "pip install --force-reinstall numba, and unset NUMBA_DISABLE_JIT"
-        return f"numba does not compile ({one_line(error)}); {remedy}"
+        return f"numba does not compile ({one_line(error)}); unset NUMBA_DISABLE_JIT, and install numba again"
     return None
 
 

@@ -155,9 +155,7 @@ def inputs(tmp_path_factory):
         nan = b"\xff" * (len(values) // 200 * count)
         (folder / name).write_bytes(header.replace(b"vertex 200", b"vertex %d" % count) + b"end_header\n" + nan)
     contents = {"in.bin": b"\x1f\x8b\xff", "damaged.json": b"{"}
-    contents |= dict.fromkeys(
-        ("a.ksplat", "a.lcc", "a.glb", "a.pth", "a.splat", "page.html", "a.7z", "a.usdz"), bytes(33)
-    )
+    contents |= dict.fromkeys("a.ksplat a.lcc a.glb a.pth a.splat page.html a.7z a.usdz".split(), bytes(33))
     contents |= {"text.mp4": b"not a video", "trained/point_cloud/iteration_30000/point_cloud.ply": b""}
     contents["trained/point_cloud/iteration_7000/point_cloud.ply"] = b""  # written later
     empty = "scene/transforms.json", "model/sparse/0/cameras.bin", "blender/transforms_train.json", "used/thesis.txt"

@@ -101,11 +101,12 @@ def test_a_high_dynamic_range_is_rolled_off(tmp_path, transfer, expected):
     assert max(red[1:]) < expected[2] + 8 < expected[4] < red[0]
 
 
-def test_the_gamut_of_p3_is_converted(tmp_path):
-    write_colours(tmp_path / "a.mkv", 5 * [patches()], 1, pixels="yuv444p", primaries=12)
+@pytest.mark.parametrize(("primaries", "space"), [(11, "DCI"), (12, "P3")])
+def test_the_gamut_of_p3_is_converted(tmp_path, primaries, space):
+    write_colours(tmp_path / "a.mkv", 5 * [patches()], 1, pixels="yuv444p", primaries=primaries)
     (frame, *_) = frames_from(tmp_path / "a.mkv")
     # The curve of the profile is not sRGB's: off by up to 9. Without a conversion it is 36.
-    assert np.abs(frame - judged(Image.fromarray(patches()), "P3"))[40:56, 8::16].max() <= 12
+    assert np.abs(frame - judged(Image.fromarray(patches()), space))[40:56, 8::16].max() <= 12
 
 
 @pytest.mark.parametrize(("degrees", "flip"), [(d, f) for d in (0, 90, 180, -90) for f in (False, True)])
@@ -161,8 +162,28 @@ def test_frames_are_counted_where_no_length_is_stated_or_that_of_a_part(tmp_path
         content = bytearray((tmp_path / name).read_bytes())
         struct.pack_into(">Ii", content, content.index(b"elst") + 12, 500, 4 * 1024)
         (tmp_path / name).write_bytes(content)
-    assert _facts(tmp_path / name) == (5, 1)
+    assert _facts(tmp_path / name) == (5, 1, 1)
     assert len(frames_from(tmp_path / name)) == 5
+
+
+def test_the_largest_of_several_videos_is_read(tmp_path):
+    path, heard = tmp_path / "a.mkv", []
+    with av.open(str(path), "w") as container:
+        kinds = [("mjpeg", "yuvj420p", 256), ("libx264", "yuv420p", 32), ("libx264", "yuv420p", 128)]
+        for codec, pixels, side in kinds:
+            video = container.add_stream(codec, rate=10)
+            video.pix_fmt, video.width, video.height = pixels, side, side
+        for pts in range(5):
+            for video in container.streams.video:
+                grey = np.full((video.height, video.width, 3), 100 + video.index * 50, np.uint8)
+                frame = av.VideoFrame.from_ndarray(grey, format="rgb24").reformat(format=video.pix_fmt)
+                frame.pts = pts
+                container.mux(video.encode(frame))
+        for video in container.streams.video:
+            container.mux(video.encode())
+    check_video(path, heard.append)
+    assert heard == [f"{path} has 3 video tracks; that of 128 x 128 px is read"]
+    assert all(frame.shape == (128, 128, 3) and abs(frame.mean() - 200) < 3 for frame in frames_from(path))
 
 
 def test_frames_with_missing_parts_are_left_out(tmp_path):
@@ -252,10 +273,7 @@ REFUSED = {
     "narrow": (lambda path: write_video(path, 5, (4000, 16)), "is 4000 x 16 px, too narrow for camera poses"),
     "HLS": (playlist("#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nfile://{}\n#EXT-X-ENDLIST\n"), UNREADABLE),
     "a panorama": (panorama, "is a panorama; export flat views"),
-    "two eyes": (
-        lambda path: write_colours(path, 5 * [patches()], x264="frame-packing=3"),
-        "has two eyes in each frame",
-    ),
+    "two eyes": (lambda path: write_colours(path, 5 * [patches()], x264="frame-packing=3"), "has two eyes in each"),
     "linear light": (lambda path: write_colours(path, 5 * [patches()], 1, transfer=8), "has linear light"),
     "Dolby Vision 5": (
         lambda path: write_colours(path, 5 * [patches()], pixels="yuv420p10le", codec="libx265", tag="dvh1"),

@@ -198,7 +198,9 @@ _NAME = 8 + 64 + len("frame_00001.png") + 1  # offset of the first image's numbe
 ROW = "1 1 0 0 0 0 0 3 1"
 MODELS = {
     "2^63 cameras": (_patch("cameras.bin", 0, "<Q", 1 << 63), "is not a complete cameras.bin"),
-    "2^30 observations": (_patch("images.bin", _NAME, "<Q", 1 << 30), "images.bin .*ends .* bytes early"),
+    "2^30 observations": (_patch("images.bin", _NAME, "<Q", 1 << 30), "images.bin .*requires a buffer"),
+    "fewer images": (_patch("images.bin", 0, "<Q", 3), r"images.bin of COLMAP \(its entries take \d+ bytes, it has"),
+    "fewer points": (_patch("points3D.bin", 0, "<Q", 3), r"points3D.bin of COLMAP \(its entries take \d+ bytes, it"),
     "a track of 2^31": (_patch("points3D.bin", 8 + 43, "<Q", 1 << 31), "is not a complete points3D.bin"),
     "a focal length of 0": (_patch("cameras.bin", 8 + 24, "<d", 0.0), "camera 1: parameter fx is 0.0"),
     "a width of 0": (_patch("cameras.bin", 8 + 8, "<Q", 0), "width is 0"),
@@ -212,8 +214,8 @@ MODELS = {
     "an absolute name": (_patch("images.bin", 8 + 64, "15s", b"/etc/passwd.png"), "leads out of the folder of images"),
     "one image": (lambda model: _text(model, f"{ROW} a.png"), "has 1 image; training needs 2"),
     "an endless name": (_patch("images.bin", 8 + 64, "10000s", b"a" * 10**4), "is not a complete images.bin"),
-    "no images": (_patch("images.bin", 0, "<Q", 0), "has no images"),
-    "no points": (_patch("points3D.bin", 0, "<Q", 0), "has no points"),
+    "no images": (lambda model: (model / "images.bin").write_bytes(bytes(8)), "has no images"),
+    "no points": (lambda model: (model / "points3D.bin").write_bytes(bytes(8)), "has no points"),
     "no observations": (lambda model: _text(model, f"{ROW} a.png\n2{ROW[1:]} b.png"), "after image 1 stands no line"),
     "no files": (shutil.rmtree, "is not a folder"),
     "a pipe": (lambda model: ((model / "images.bin").unlink(), os.mkfifo(model / "images.bin")), "it is a pipe"),

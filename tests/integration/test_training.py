@@ -339,9 +339,7 @@ def little_memory():
 
 
 @pytest.mark.gpu
-def test_memory_that_runs_out_is_named_and_training_goes_on_from_the_last_checkpoint(
-    tiny, trainer_of, resumed, little_memory
-):
+def test_full_memory_is_named_and_training_goes_on_from_the_last_save(tiny, trainer_of, resumed, little_memory):
     """Gaussians all but double every few steps, until the GPU has no more memory for them."""
     growing = {"pruning.mode": "off", "warmup_length": 4, "refine_every": 5, "stop_split_at": 400}
     growing |= {"densify_grad_thresh": 0.0, "cull_alpha_thresh": 0.005, "reset_alpha_every": 1000}

@@ -113,18 +113,10 @@ def _renamed(old, new):
 
 DAMAGED = {
     "an empty .splat": ("a.splat", lambda path: path.touch(), "0 Gaussians"),
-    "a web page": (
-        "a.splat",
-        lambda path: path.write_text("<!DOCTYPE HTML>" + 49 * " "),
-        "is a web page; download the f",
-    ),
+    "a web page": ("a.splat", lambda path: path.write_text("<!DOCTYPE HTML>" + 49 * " "), "web page; download the f"),
     "an image": ("a.splat", lambda path: path.write_bytes(b"\xff\xd8\xff\xe1" * 16), "has negative widths"),
     "another text": ("a.splat", lambda path: path.write_text(32 * "ä"), "it is text"),
-    "a pointer of Git LFS": (
-        "a.ply",
-        lambda path: path.write_text("version https://git-lfs.github.com/"),
-        "git lfs pull",
-    ),
+    "a pointer of LFS": ("a.ply", lambda path: path.write_text("version https://git-lfs.github.com/"), "git lfs pull"),
     "half a Gaussian": ("a.splat", _changed("a.splat", lambda data: data[:48]), "a multiple of element size"),
     "a short compressed .ply": ("a.ply", _changed("a.compressed.ply", lambda data: data[:2000]), "header states at"),
     "no chunks": ("a.ply", _renamed(b"element chunk", b"element chump"), "compressed .ply"),

@@ -25,9 +25,10 @@ RGB = np.array([[0, 128, 255], [10, 20, 30]], np.uint8)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
-@pytest.mark.parametrize("n", [0, 1, 50])
+@pytest.mark.parametrize("n", [0, 1, 150])
 def test_round_trip_is_exact(tmp_path, n, degree):
     params = small_field(n, degree)
+    params["scales"] += 8  # in millimetres
     given = {name: torch.nn.Parameter(value.double()) for name, value in params.items()}
     write_ply(tmp_path / "a.ply", {**given, "features": torch.zeros(n, 13)})
     back = read_ply(tmp_path / "a.ply")
@@ -58,7 +59,7 @@ def _columns(change, **options):
 
 
 def _big_endian_doubles(columns):
-    more = {"segment": np.zeros(9, "<i4"), "semantic_0": np.ones(9)}
+    more = {"segment": np.zeros(9, "<i4"), "semantic_0": np.ones(9), "sh_degree": np.ones(9)}
     return more | {name: columns[name].astype(">f8") for name in sorted(columns, reverse=True)}
 
 
@@ -229,12 +230,15 @@ WRONG = {
     "4D Gaussians by their scales": (_with("scale_3"), "holds 4D Gaussians .scale_3."),
     "Student's t": (_with("nu_degree"), "Gaussians of another kernel .nu_degree."),
     "Brush's 4D": (_header(b"end_header", b"element delta_vertex_0 0\nproperty uchar x\nend_header"), "holds 4D"),
-    "Scaffold-GS": (_with("f_offset_0", "f_anchor_feat_0", without="f_"), "network for its colours .f_anchor_feat_0."),
+    "Scaffold-GS": (_with("scale_3", "f_anchor_feat_0", without="f_"), "network for its colours .f_anchor_feat_0."),
+    "SH in channels": (_with("sh_0_r", without="f_"), "harmonics by other names .sh_0_r.; export them as f_dc_0"),
+    "harmonics of a checkpoint": (_with("features_rest_0", without="f_rest"), "by other names .features_rest_0."),
     "features for colours": (_with("color_feature_0", without="f_"), "a network for its colours"),
     "codes": (_columns(lambda c: c | {"rot_2": np.zeros(7, np.uint8)}), "has codes of a table for rot_2"),
     "lists": (_columns(_lists), "property corners of each vertex .* is a list"),
     "widths": (_columns(lambda columns: dict.fromkeys(columns, np.full(200, 0.5, "f4"))), "not their logarithms"),
     "no logs": (_columns(lambda c: dict.fromkeys(c, np.full(200, 0.05)) | {"opacity": np.full(200, 3.0)}), "not their"),
+    "large": (_columns(lambda c: dict.fromkeys(c, np.logspace(-1, 2, 200)) | {"opacity": np.full(200, 3.0)}), "not th"),
     "shares": (_columns(lambda c: dict.fromkeys(c, np.zeros(200)) | {"opacity": np.linspace(0, 1, 200)}), "not their"),
     "lists before": (_header(b"element", FACES % 1 + b"element"), "each face"),
     "a cut text": (lambda path: (_text(path), path.write_bytes(path.read_bytes()[:-400])), "it has 6|columns"),

@@ -213,9 +213,7 @@ def test_a_panorama_with_one_step_aside_keeps_its_scale(capture, load, edit, cap
 
 
 @pytest.mark.parametrize("applied", [None, [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]])
-def test_survey_coordinates_train_as_those_near_the_origin_and_come_back(
-    capture, still_life, load, edit, tmp_path, applied
-):
+def test_survey_coordinates_train_as_those_near_zero_and_come_back(capture, still_life, load, edit, tmp_path, applied):
     moved(capture, SURVEY, edit)
     edit(capture, applied_transform=applied)
     made = load(capture)

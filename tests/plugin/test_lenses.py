@@ -274,10 +274,7 @@ WRITERS = {
         {**LENS, **AXES, "orientation_override": "none"},
         lambda index: {**LENS, **(OPENCV, ROUND)[index % 2], "fl_x": 33 + index, "k1": 0.01 * index, "cx": 12 + index},
     ),
-    "ns-process-data, a fisheye video": (
-        {**LENS, **ROUND, "k1": 0.03, "k2": 0.01, "k3": 0.0, "k4": 0.002},
-        lambda index: {},
-    ),
+    "ns-process-data, fisheye": ({**LENS, **ROUND, "k1": 0.03, "k2": 0.01, "k3": 0.0, "k4": 0.002}, lambda index: {}),
     "Metashape": (OPENCV, lambda index: METASHAPE),
     "instant-ngp": (
         {**LENS, "camera_angle_x": 0.7, "camera_angle_y": 0.7, "k1": 0.01, "is_fisheye": False, "aabb_scale": 16},

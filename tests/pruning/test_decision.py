@@ -91,9 +91,7 @@ HARD = {
     "coplanar": lambda: cloud(600) * torch.tensor([1.0, 1.0, 0.0]),
     "two clusters 1e6 apart": lambda: torch.cat([cloud(300), cloud(300) + 1e6]),
     "all isolated but two": lambda: torch.cat([1e4 * cloud(40), torch.zeros(2, 3)]),
-    "floaters out of reach of float32's squares": lambda: torch.cat(
-        [cloud(600), torch.tensor([[3e38, 0, 0], [3e38, 0, 0]])]
-    ),
+    "floaters out of reach of squares": lambda: torch.cat([cloud(600), torch.tensor([[3e38, 0, 0], [3e38, 0, 0]])]),
     "clusters of 1e-5 beside 1e3": lambda: torch.cat([cloud(300) * 1e-5, cloud(300) * 1e3]),
     "1e-25 small": lambda: cloud(600) * 1e-25,
     "every point twice": lambda: cloud(300).repeat(2, 1),

@@ -157,9 +157,8 @@ def test_nan_is_left_to_gsplat():
 def test_radii_per_axis():
     primitives = gaussians(200, 150, 100)
     per_axis = {**primitives, "radii": primitives["radii"][:, None].repeat(1, 2)}
-    assert all(
-        torch.equal(a, b) for a, b in zip(by_tile(per_axis, 150, 100), by_tile(primitives, 150, 100), strict=True)
-    )
+    one, other = (by_tile(rows, 150, 100) for rows in (per_axis, primitives))
+    assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
     per_axis["radii"][:, 1] = per_axis["radii"][:, 1] // 3
     for tile, found in enumerate(by_tile(per_axis, 150, 100)):
         assert in_square(per_axis, tile % 10, tile // 10, 10, 7)[found].all()

@@ -101,7 +101,8 @@ def test_compiles_without_a_cache_folder():
     assert parallel.compiled(made["double"])(4) == 8
 
 
-def test_a_notice_is_printed_once_for_long_compilation(monkeypatch, capsys):
+@pytest.mark.parametrize(("folder", "often"), [("/a", "precision"), (None, "command; set NUMBA_CACHE_DIR")])
+def test_a_notice_is_printed_once_for_long_compilation(monkeypatch, capsys, folder, often):
     monkeypatch.setattr(parallel, "_noticed", [])
     monkeypatch.setattr(parallel, "_NOTICE_AFTER", 0.05)
 
@@ -111,10 +112,10 @@ def test_a_notice_is_printed_once_for_long_compilation(monkeypatch, capsys):
         def loop(begin, end):
             time.sleep(seconds if begin == end else 0.0)
 
-        loop.stats = SimpleNamespace(cache_misses={"types": misses} if misses else {})
+        loop.stats = SimpleNamespace(cache_misses={"types": misses} if misses else {}, cache_path=folder)
         parallel.parallel_for(loop, 3)
         return capsys.readouterr().err
 
     assert (printed(0.0, 1), printed(0.3, 0)) == ("", "")
-    assert printed(0.3, 1).count("compiling") == 1
+    assert printed(0.3, 1).count(f"compiling the CPU rasteriser, some ten seconds, once for each {often}") == 1
     assert printed(0.3, 1) == ""

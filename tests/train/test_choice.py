@@ -162,10 +162,8 @@ def test_all_pixels_count_or_those_under_the_mask(pair):
 
 def test_views_count_by_their_pixels_and_a_masked_view_not_at_all(pair):
     assert view_quality(*pair, torch.zeros(24, 32, dtype=torch.bool)).pixels == 0
-    assert choice.mean_quality([HeldOutQuality(300, 20.0, 0.5), HeldOutQuality(100, 40.0, 0.9)]) == (
-        25.0,
-        pytest.approx(0.6),
-    )
+    mean = choice.mean_quality([HeldOutQuality(300, 20.0, 0.5), HeldOutQuality(100, 40.0, 0.9)])
+    assert mean == (25.0, pytest.approx(0.6))
 
 
 def test_an_exact_image_and_a_small_one_are_finite_and_a_broken_one_is_not(pair):

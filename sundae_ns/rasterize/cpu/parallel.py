@@ -98,7 +98,8 @@ def parallel_for(loop: Callable[..., None], count: int, *arguments: Any, min_per
 def _print_notice(loop: Any) -> None:
     if loop.stats.cache_misses and not _noticed:  # reading code from disk is slow too on a busy machine
         _noticed.append(loop)
-        print("sundae: compiling the CPU rasteriser, some ten seconds, once for each precision", file=sys.stderr)
+        each = "precision" if loop.stats.cache_path else "command; set NUMBA_CACHE_DIR to a folder that can be written"
+        print(f"sundae: compiling the CPU rasteriser, some ten seconds, once for each {each}", file=sys.stderr)
 
 
 @lru_cache(maxsize=1)
