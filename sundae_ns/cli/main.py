@@ -95,8 +95,8 @@ def _dispatch(words: Sequence[str]) -> int:
 
 def exit_with(command: Callable[[], int], name: str) -> NoReturn:
     """Run a command and exit with its code; 2 after the one line of a :class:`SundaeError`, 130 for an interrupt."""
-    for variable, value in ENVIRONMENT.items():
-        os.environ.setdefault(variable, value)
+    home = os.path.expanduser("~")  # of no account: numba would make a folder ~ here for its cache
+    os.environ.update({**ENVIRONMENT, "HOME": "/" if home == "~" else home, **os.environ})
     try:
         # Commands name the file that they cannot write; this covers others, such as a full disk behind stdout.
         with writing(f"{name} ended early"):

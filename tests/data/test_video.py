@@ -169,8 +169,7 @@ def test_frames_are_counted_where_no_length_is_stated_or_that_of_a_part(tmp_path
 def test_the_largest_of_several_videos_is_read(tmp_path):
     path, heard = tmp_path / "a.mkv", []
     with av.open(str(path), "w") as container:
-        kinds = [("mjpeg", "yuvj420p", 256), ("libx264", "yuv420p", 32), ("libx264", "yuv420p", 128)]
-        for codec, pixels, side in kinds:
+        for codec, pixels, side in (("mjpeg", "yuvj420p", 256), ("h264", "yuv420p", 32), ("h264", "yuv420p", 128)):
             video = container.add_stream(codec, rate=10)
             video.pix_fmt, video.width, video.height = pixels, side, side
         for pts in range(5):
