@@ -16,7 +16,7 @@ from sundae_ns.cli.options import Advanced, Flag, Float, Out, Plain, Scene, Scen
 from sundae_ns.cli.refusals import check_exclusive, check_file, check_least
 from sundae_ns.core.errors import ConfigError, SundaeError
 from sundae_ns.core.tables import MEGABYTE, without_nan
-from sundae_ns.io.formats import PRIMITIVES, kind_of, kind_of_gaussians
+from sundae_ns.io.formats import FORMATS, PRIMITIVES, kind_of, kind_of_gaussians
 from sundae_ns.io.pack.config import FINETUNED, FINETUNED_SIZE, PackConfig
 from sundae_ns.io.pack.packed_scene import Codecs, PackedScene, fit_scene, pack_bytes, write_fitted
 from sundae_ns.io.run_folder import files_of
@@ -55,6 +55,8 @@ def pack(
     wishes.check_wishes()
     check_exclusive(max_mb=max_mb, target_drop=target_drop)
     check_least(max_cameras=(advanced.max_cameras, 0), finetune=(steps, 0), target_drop=(target_drop, 0.001))
+    if out.suffix.lower() in (*FORMATS, ".html"):
+        raise ConfigError(f"{out} is a name of another format; name it .sundae, or write it with sundae export")
     if wishes.cleans and (steps or target_drop is not None):
         raise ConfigError(f"--finetune and --target-drop need the whole scene; leave out {wishes.cleans[0]}, or them")
     check_file(out, reads=[*files_of(run), advanced.data, advanced.cameras], overwrite=advanced.overwrite)

@@ -78,7 +78,7 @@ def check_poses(photos: Path, options: PoseOptions, *, remarks: bool = True) -> 
         check_video(photos, warn)
         return None
     if not photos.is_dir():
-        raise DataError(f"{photos} is neither a folder of photos nor a video ({', '.join(SUFFIXES)})")
+        raise DataError(f"{photos} is no folder of photos or video ({', '.join(SUFFIXES)}); sundae prune takes scenes")
     files = find_photos(photos, warn)
     if (remark := left_out(photos)) is not None:
         warn(remark)

@@ -16,8 +16,6 @@ from sundae_ns.scene.cameras import MOST_CAMERAS, film_views, opening
 from sundae_ns.scene.scene import image_of
 from sundae_ns.scene.scene import render as render_view
 
-IMAGES = (".png", ".jpg", ".jpeg", ".webp")
-
 
 def render(
     scene: Scene,
@@ -40,23 +38,27 @@ def render(
         seconds: length of a film; by default 12.
         fps: frames a second of a video; by default those of the camera path, else 24.
     """
-    video = check_suffix(out, (*IMAGES, ".mp4")) == ".mp4"
+    video = check_suffix(out, (".png", ".jpg", ".jpeg", ".webp", ".mp4")) == ".mp4"
     check_least(width=(width, 2))
     if fps is not None and not (video and 0 < fps <= 240):
         raise ConfigError("--fps is of a video, from above 0 to 240; leave it out, or name a video .mp4")
     wishes.check_wishes()
     check_file(out, reads=[scene, advanced.cameras], overwrite=advanced.overwrite)
     edit = opened(scene, wishes, advanced, most=MOST_CAMERAS)
-    left, speed = edit.reduced(Path("scene.sundae")).stated.to(fastest_device()), edit.speed
-    views = list(left.cameras)
+    views, speed = list(edit.scene.cameras), edit.speed
     if (seconds is not None and (speed is not None or not video)) or (video and view is not None):
         raise ConfigError("--seconds is the length of a film without a camera path, --view of an image; leave it out")
+    if not video and view is None and (advanced.start_view is not None or advanced.cameras is None):
+        views = [edit.scene.start] if edit.scene.start else views
+    if not video and ((view is None and len(views) > 1) or (view or 0) not in range(max(len(views), 1))):
+        several = f"there are {len(views)} cameras; give --view 0 to {len(views) - 1}, or write an .mp4"
+        raise ConfigError(several if len(views) > 1 else "there is one camera; leave out --view")
+    left = edit.reduced(Path("scene.sundae")).stated.to(fastest_device())
     if video and speed is None:
         with Console(stderr=True).status("Finding a path"):
             views = film_views(left, seconds=12.0 if seconds is None else seconds, frames_per_second=fps or 24)
-    elif (view is None and advanced.cameras is None) or not views:
-        views = [start] if (start := opening(left).start) is not None else views
-    views = [each if width is None else each.zoomed(width / each.width) for each in views]
+    shown = views or list(filter(None, [opening(left).start]))
+    views = [each if width is None else each.zoomed(width / each.width) for each in shown]
     if video:  # whose colours have half the size
         views = [each._replace(width=each.width // 2 * 2, height=each.height // 2 * 2) for each in views]
         speed = fps or speed or 24
@@ -65,9 +67,6 @@ def render(
             count = write_video(partial, images, frames_per_second=speed)
         print(f"{out}: {count} frames of {views[0].width} x {views[0].height} px, {count / speed:.1f} s")
         return 0
-    if (view is None and len(views) > 1) or not 0 <= (index := view or 0) < len(views):
-        several = f"there are {len(views)} cameras; give --view 0 to {len(views) - 1}, or write an .mp4"
-        raise ConfigError(several if len(views) > 1 else "there is one camera; leave out --view")
-    write_image(out, image_of(render_view(left, views[index]).rgb))
-    print(f"{out}: {views[index].width} x {views[index].height} px")
+    write_image(out, image_of(render_view(left, views[view or 0]).rgb))
+    print(f"{out}: {views[view or 0].width} x {views[view or 0].height} px")
     return 0

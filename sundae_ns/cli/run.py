@@ -97,14 +97,13 @@ class Project:
         def pack() -> int:
             return pack_run(self.run, packed, *data, *self.train.pack_words, finetune=self.tunes)
 
-        steps = [
+        rest = [
             Step("train", self._train, self._trained),
             Step("pack", pack, lambda: read_sections(packed, read_header(packed)), packed),
             Step("report", lambda: run_command(measure), lambda: _check_report(report), report),
             Step("web page", lambda: run_command(export), lambda: _check_page(page), page),
         ]
-        poses = Step("camera poses", self._find_poses, lambda: placed_in(self.capture))
-        return steps if self.posed else [poses, *steps]
+        return rest if self.posed else [Step("camera poses", self._find_poses, lambda: placed_in(self.capture)), *rest]
 
     def _find_poses(self) -> int:
         put_aside(self.capture)  # damaged

@@ -104,4 +104,6 @@ def test_an_image_is_that_of_the_start_view(folder, tmp_path):
     assert run(tmp_path / "a.sundae", "-o", tmp_path / "a.png") == 0
     assert pixels(tmp_path / "a.png").shape == (62, 82, 3)
     assert run(tmp_path / "a.sundae", "-o", tmp_path / "b.png", "--view", 0) == 0
-    assert pixels(tmp_path / "b.png").shape == (31, 41, 3)
+    given = "--cameras", folder / "packed.sundae", "--start-view", 1
+    assert run(folder / "packed.sundae", "-o", tmp_path / "c.png", *given) == 0
+    assert pixels(tmp_path / "b.png").shape == pixels(tmp_path / "c.png").shape == (31, 41, 3)
