@@ -1,7 +1,7 @@
 """Draw the plots of docs/results.md from benchmarks/results, into docs/figures.
 
-python benchmarks/plot.py            # curve.png, error.png, asked.png
-python benchmarks/plot.py curve      # one of them
+python benchmarks/plot.py            # error.png, asked.png
+python benchmarks/plot.py asked      # one of them
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ STYLES = {
     "sundae": ("o", "tab:red"),
     "sundae, fine-tuned": ("P", "tab:red"),
     "sundae-fast": ("D", "tab:blue"),
-    "fixed shares": ("o", "tab:blue"),
 }
 """Markers and colours of methods."""
 
@@ -45,39 +44,6 @@ def legend(figure: Any) -> None:
     """One legend for all panels."""
     lines = {line.get_label(): line for panel in figure.axes for line in panel.get_legend_handles_labels()[0]}
     figure.legend(lines.values(), lines, fontsize=9, loc="outside lower center", ncols=4)
-
-
-def plot_curve() -> Any:
-    """PSNR and SSIM of packed scenes by size: fixed shares, what the default has chosen, and its fine-tuned pack."""
-    rows = [row for row in lines_of("curve.csv") if row["seed"] == "42"]
-    packs = [row for row in lines_of("formats.csv") if (row["format"], row["method"]) == (".sundae", "splatfacto")]
-    captures = list(dict.fromkeys(row["capture"] for row in rows))
-    layout: dict[str, Any] = {"figsize": (3 * len(captures), 5.5), "layout": "constrained", "sharex": "col"}
-    figure, panels = plt.subplots(2, len(captures), **layout)
-    for number, panel in enumerate(panels.flat):
-        capture, metric = captures[number % len(captures)], "ssim" if number >= len(captures) else "psnr"
-        own = [row for row in rows if (row["capture"], row["method"]) == (capture, "sundae")]
-        own.sort(key=lambda row: float(row["share"]))
-        fixed, chosen = ([row for row in own if row["chosen"] == word] for word in ("no", "yes"))
-        stock = [row for row in packs if row["capture"] == capture]
-        kinds = [("packed_", fixed, "o-", "fixed shares"), ("packed_", chosen, "D", "sundae")]
-        kinds += [("tuned_", chosen, "P", "sundae, fine-tuned"), ("", stock, "s", "splatfacto")]
-        for kind, packed, marker, label in kinds:
-            spots = [(int(row[f"{kind}bytes"]) / MB, float(row[f"{kind}{metric}"])) for row in packed]
-            style: dict[str, Any] = {"color": STYLES[label][1], "markersize": 7}
-            panel.plot(*zip(*spots), marker, label=label, **style)
-            for spot, row in zip(spots, packed, strict=True):
-                if kind == "packed_" and row["head"] == "no":
-                    panel.plot(*spot, marker[0], markerfacecolor="white", **style)
-                if packed is fixed:
-                    share = f"{100 * float(row['share']):g}%"
-                    panel.annotate(share, spot, (4, -10), textcoords="offset points", fontsize=7)
-        logarithmic(panel, [0.3, 1, 3, 10])
-        panel.margins(y=0.12)
-        panel.set(**({"title": capture} if metric == "psnr" else {"xlabel": "MB, packed"}))
-    panels[0, 0].set_ylabel("test PSNR, dB")
-    panels[1, 0].set_ylabel("test SSIM")
-    return figure
 
 
 def plot_error() -> Any:
@@ -109,12 +75,13 @@ def plot_error() -> Any:
     logarithmic(seconds, [30, 100, 300])
     logarithmic(sizes, [0.3, 1, 3, 10])
     frames.set_xlim(0)
-    for row in (row for row in lines_of("graph.jsonl") if row["distribution"] in ("field", "uniform")):
+    for row in (row for row in lines_of("graph.jsonl") if row["distribution"] == "field"):
         label, color = ("H100, H200", "tab:green") if row["device"] == "cuda" else ("CPU", "tab:orange")
         spot = row["seconds"], row["response_rel_error"]
         graph.plot(*spot, "v", color=color, label=f"graph and response, {label}")
         graph.annotate(f"{row['points'] / 1e6:g}M", spot, (4, 5), textcoords="offset points", fontsize=7)
     graph.set(xlabel="seconds for millions of points", ylabel="relative error", yscale="log", ylim=(1e-8, 1e-6))
+    graph.margins(x=0.1)
     logarithmic(graph, [0.01, 0.1, 1])
     return figure
 
@@ -127,7 +94,7 @@ def lines(panel: Any, name: str, series: Callable[[dict[str, Any]], Any], x: str
             at = row[x] if x == "capture" else float(row[x].partition("%")[0])
             groups.setdefault(label, {}).setdefault(at, []).append(row)
     for marker, (label, rows) in zip("osD^vPX*hd" * 2, groups.items()):
-        line = marker if x in ("capture", "psnr_lost") else f"{marker}-"
+        line = marker if x == "capture" else f"{marker}-"
         panel.plot(sorted(rows), [mean(rows[at], y) for at in sorted(rows)], line, label=label, fillstyle="none")
     panel.legend(fontsize=7)
 
@@ -153,18 +120,22 @@ def plot_asked() -> Any:
     few.axhline(psnr, color="black", linestyle="--", label="16 views, default")
     lines(few, "few_counts.csv", few_photos, "arm", "psnr")
     lines(light, "gains.csv", changed_light, "capture", "psnr")
-    lines(cleaning, "cleaning.csv", lambda row: row["others_removed"] and row["strength"], "psnr_lost", "removed")
+    for marker, strength in zip("os", ("0.25", "0.5")):
+        fields = [row for row in lines_of("cleaning.csv") if (row["kind"], row["strength"]) == ("all", strength)]
+        spots = [(float(row["psnr_lost"]), int(row["removed"])) for row in fields]
+        cleaning.plot(*zip(*spots), marker, label=strength, fillstyle="none")
+    cleaning.legend(fontsize=7)
     sizes.set(title="asked sizes", xlabel="MB got", ylabel="PSNR, dB")
     levels.set(title="levels, mean of fields", xlabel="share of Gaussians", ylabel="PSNR to the field, dB")
     cleaning.set(title="cleaning by strength", xlabel="PSNR lost, dB", ylabel="floaters found of 400", ylim=(360, 401))
-    few.set(title="few photos, mean of captures", xlabel="Gaussians kept, %", ylabel="test PSNR, dB", ylim=(18.2, 23.2))
+    few.set(title="few photos, mean of captures", xlabel="Gaussians kept, %", ylabel="test PSNR, dB", ylim=(18.2, 24))
     light.set(title="exposures changed by 15%", ylabel="test PSNR, dB", xmargin=0.3, ymargin=0.3)
     lines(rules, "rules.csv", lambda row: row["scene"] == "bonsai" and RULES.get(row["rule"]), "keep", "psnr")
     rules.set(title="rules, bonsai, no head", xlabel="share of Gaussians", ylabel="test PSNR, dB")
     return figure
 
 
-PLOTS: dict[str, Callable[[], Any]] = {"curve": plot_curve, "error": plot_error, "asked": plot_asked}
+PLOTS: dict[str, Callable[[], Any]] = {"error": plot_error, "asked": plot_asked}
 
 
 def main() -> None:

@@ -207,7 +207,7 @@ def multi_gpu() -> list[str]:
     for line in sorted(lines_of("multi_gpu.jsonl"), key=lambda line: (line["variant"], line["ranks"])):
         field = f"{line['scene']}, tiled"
         psnr = list(line["psnr_after_images"].values())[-1]
-        cells = [f"{line['ranks']} {gpu(line['gpu'])}"]
+        cells = [f"{line['ranks']} {gpu(line['gpu'].rpartition(' x ')[2])}"]
         figures = ((line["primitives"], 0), (line["images_per_s"], 1), (psnr, 2), (max(line["peak_mib"]), 0))
         rows.append([field if field != above else "", *cells, *(number(*figure) for figure in figures)])
         above = field
