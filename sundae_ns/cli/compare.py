@@ -23,6 +23,8 @@ from sundae_ns.core.files import write_files
 from sundae_ns.core.metrics import Lpips, Net, lpips_weights
 from sundae_ns.io.formats import FORMATS
 from sundae_ns.rasterize.interface import fastest_device
+from sundae_ns.report.measure import against_first, against_photos, csv_text, labels_of, markdown, measure
+from sundae_ns.report.report_page import ShownRun, report_page, shown_views
 from sundae_ns.scene.describe import HELD_OUT, held_out_cameras
 from sundae_ns.scene.load_save import load, save
 from sundae_ns.train.curve import read_count_curve
@@ -68,10 +70,8 @@ def compare(
     if formats and len(scenes) > 1:
         raise ConfigError(f"--formats compares one scene with itself; leave out {scenes[1]}, or --formats")
     first = None if photos else load(scenes[0]).to(fastest_device())
-    from sundae_ns.report.measure import against_first, against_photos, csv_text, labels_of, markdown, measure
-    from sundae_ns.report.report_page import ShownRun, report_page, shown_views
-
-    repeats, command = (5 if photos else 0) if repeats is None else repeats, shlex.join(["sundae", *typed])
+    command = shlex.join(["sundae", *typed])
+    repeats = (5 if photos else 0) if repeats is None else repeats
     lpips = Lpips(lpips_net) if photos and lpips_weights(lpips_net)[1].is_file() else None
     missing = f"LPIPS: the weights of its net ({lpips_net}) are missing; sundae doctor says where to put them."
     notes = [missing] if photos and lpips is None else []

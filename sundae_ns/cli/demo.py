@@ -22,9 +22,9 @@ def demo(out: Input = Path(".demo"), steps: Int = None, overwrite: Overwrite = F
     """
     check_folder(out, reads=[], overwrite=overwrite)
     check_least(steps=(steps, 1))
+    train = TrainOptions(method="sundae-tiny", steps=steps)
     # Where no training view looks, above all beside the sky, a dark background shows as stains.
-    more, train = ("--pipeline.model.background-color", "white"), TrainOptions(method="sundae-tiny", steps=steps)
-    project = Project(out / "scene", out, train=train, more=more)
+    project = Project(out / "scene", out, train=train, more=("--pipeline.model.background-color", "white"))
     with writing(f"cannot write to {out}"):
         write_demo_capture(project.photos)
         shutil.rmtree(project.run, ignore_errors=True)  # of an earlier demo

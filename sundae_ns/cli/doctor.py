@@ -24,7 +24,11 @@ from rich.table import Table
 from sundae_ns.cli.options import Flag
 from sundae_ns.core.errors import BackendError, SundaeError
 from sundae_ns.core.metrics import lpips_weights
+from sundae_ns.cuda import loss
 from sundae_ns.data.reconstruct import INSTALL, pycolmap
+from sundae_ns.graph import neighbors
+from sundae_ns.head import fused
+from sundae_ns.head.head import CompensationHead, HeadConfig
 from sundae_ns.rasterize import interface
 
 PACKAGES = ("sundae-ns", "nerfstudio", "gsplat", "torch", "torchvision", "numpy", "scipy", "tyro")
@@ -59,7 +63,8 @@ def doctor(compile: Flag = False) -> int:  # noqa: A002
 
 def parts(compile_kernels: bool = False) -> list[Part]:
     """Check all parts, in the order of the report."""
-    cuda, (url, weights) = torch.version.cuda or "", lpips_weights()
+    cuda = torch.version.cuda or ""
+    url, weights = lpips_weights()
     driver = {"12": 525, "13": 580}.get(cuda.partition(".")[0], "of its CUDA version")  # the oldest for Linux
     fix_cuda = (
         "apt-get install nvidia-driver (Ubuntu: ubuntu-drivers install), reboot, and look at nvidia-smi. This torch "
@@ -90,12 +95,13 @@ def parts(compile_kernels: bool = False) -> list[Part]:
 
 def _checked(name: str, check: Callable[[], str | None], remedy: str, purpose: str) -> Part:
     """The part of a check, which returns nothing or raises an error if the part is missing."""
+    found, problem = None, "not found"
     try:
-        found, problem = check(), "not found"
+        found = check()
     except metadata.PackageNotFoundError:
-        found, problem = None, "not installed"
+        problem = "not installed"
     except SundaeError as error:
-        found, problem = None, str(error)
+        problem = str(error)
     return Part(name, bool(found), (found or problem) + (f", for {purpose}" if purpose else ""), remedy)
 
 
@@ -140,16 +146,11 @@ def kernels_built() -> bool:
 
 
 def _kernels() -> str:
-    from sundae_ns.cuda.loss import loss_kernels
-    from sundae_ns.graph.neighbors import load_kernel
-    from sundae_ns.head.fused import head_kernels, head_options
-    from sundae_ns.head.head import CompensationHead, HeadConfig
-
     _cuda()
     device = torch.device("cuda", 0)
-    load_kernel(device, torch.float32, 16)
-    loss_kernels(device)
-    head_kernels(device, torch.bfloat16, head_options(CompensationHead(HeadConfig()).net, True))
+    neighbors.load_kernel(device, torch.float32, 16)
+    loss.loss_kernels(device)
+    fused.head_kernels(device, torch.bfloat16, fused.head_options(CompensationHead(HeadConfig()).net, True))
     return "working"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 import tyro
@@ -19,6 +20,7 @@ from sundae_ns.io.sog import STREAMED
 from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.scene.load_save import marks_of
 from sundae_ns.scene.page import write_page
+from sundae_ns.scene.scene import Scene as LoadedScene
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,6 @@ def export(
         lod: write levels of detail as streamed SOG (lod-meta.json) into the folder, for PlayCanvas's viewers. Below
             the full scene are a half, a quarter and a tenth of it, pruned and trained on its images; minutes on a GPU.
     """
-    wishes.check_wishes()
     suffix, upright = out.suffix.lower(), advanced.upright
     page = suffix in (".html", "") and not lod
     if lod and (suffix or wishes.max_mb is not None):
@@ -64,13 +65,13 @@ def export(
     if not page and (beside is not None or views or advanced.start_view is not None):
         raise ConfigError("only a page shows two scenes, views or a start view; name it .html; sn.merge joins two")
     before = opened(scene, wishes, advanced, capture=page or lod)
-    copies, changes = before.copies_rows(out), bool(wishes.cleans or wishes.reduces)
-    if copies and (upright or not changes):
+    changes = bool(wishes.cleans or wishes.reduces)
+    if before.copies_rows(out) and (upright or not changes):
         raise ConfigError(f"{scene} is a .ply already; name another suffix, or what to change, as --count")
     if upright and not before.scene.in_model_frame:
         raise ConfigError(f"{scene} is not in nerfstudio's coordinates, which --upright turns; leave it out")
     left = before if page else before.reduced(out, write=lambda edit, path: edit.write(path, upright=upright))
-    file, costs = out if suffix else out / (STREAMED if lod else "scene.sundae"), True
+    costs = True
     if page:
         second = [] if beside is None else [opened(beside, Wishes(), SceneDetails(), capture=True).for_page()]
         named = {name: link for name, _, link in (word.partition("=") for word in views)}
@@ -79,30 +80,32 @@ def export(
         print(f"{out}: {size:,} bytes; {'open it in a browser' if suffix else 'serve it'}")
         costs = kind_of(scene) != "packed" or first[1] is not before.scene
     elif lod:
-        from sundae_ns.plugin.distill import levels_of  # imports nerfstudio, which takes seconds
-
-        levels = [left.scene.to(fastest_device())]
-        with progress_bar() as bar:
-            task = bar.add_task("Levels of detail", total=None)
-            trained = levels_of(levels[0], left.scene.cameras, lambda i, n: bar.update(task, completed=i, total=n))
-            for level, psnr in trained:
-                print(f"{level.num_gaussians:,} Gaussians: {psnr:.2f} dB against the full scene, on held-out cameras")
-                levels.append(level)
-        write_levels(out, [level.gaussians for level in levels], marks_of(levels[0]), upright=upright)
-        print(f"{file}: {levels[0].num_gaussians:,} Gaussians and {len(levels) - 1} levels below")
-    elif copies:
-        left.write(out)
-        print(f"{out}: {left.scene.num_gaussians:,} of {len(left.rows):,} Gaussians")
+        _write_levels(left.scene.to(fastest_device()), out, upright=upright)
     else:
         with Console(stderr=True).status(f"Writing {left.scene.num_gaussians:,} Gaussians"):  # a .sog takes minutes
             left.write(out, upright=upright)
-        stated, mode = left.stated.gaussians.sh_degree, ", antialiased" if left.scene.antialiased else ""
+        stated = left.stated.gaussians.sh_degree
         degree = stated if suffix == ".ply" else min(stated, MAX_SH_DEGREE)
+        mode = ", antialiased" if left.scene.antialiased else ""
         print(f"{out}: {left.scene.num_gaussians:,} Gaussians, degree {degree}{mode}, {out.stat().st_size:,} bytes")
         if degree < stated:
             print(f"left out harmonics above SH degree {degree}, which {suffix} cannot store; .ply can")
         exact = suffix in (".ply", ".glb") and degree == before.scene.gaussians.sh_degree
         costs = not exact or before.scene.head is not None or changes
     if costs:
-        before.print_cost(file, upright=upright)
+        before.print_cost(out if suffix else out / (STREAMED if lod else "scene.sundae"), upright=upright)
     return 0
+
+
+def _write_levels(scene: LoadedScene, folder: Path, *, upright: bool) -> None:
+    """Write a scene and smaller ones that are trained on its images."""
+    from sundae_ns.plugin.distill import levels_of  # imports nerfstudio, which takes seconds
+
+    levels = [scene]
+    with progress_bar() as bar:
+        task = bar.add_task("Levels of detail", total=None)
+        for level, psnr in levels_of(scene, scene.cameras, lambda i, n: bar.update(task, completed=i, total=n)):
+            print(f"{level.num_gaussians:,} Gaussians: {psnr:.2f} dB against the full scene, on held-out cameras")
+            levels.append(level)
+    write_levels(folder, [level.gaussians for level in levels], marks_of(scene), upright=upright)
+    print(f"{folder / STREAMED}: {scene.num_gaussians:,} Gaussians and {len(levels) - 1} levels below")

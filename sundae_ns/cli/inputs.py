@@ -29,6 +29,7 @@ from sundae_ns.io.pack import container
 from sundae_ns.io.ply import has_own_columns, keep_vertices
 from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.rasterize.interface import fastest_device
+from sundae_ns.report.measure import cost_line
 from sundae_ns.scene.cameras import opening, read_cameras, spread, with_start
 from sundae_ns.scene.compose import crop_mask, floater_mask, transform
 from sundae_ns.scene.describe import write_preview
@@ -168,10 +169,8 @@ class Edit(NamedTuple):
 
     def print_cost(self, file: Path, *, upright: bool = False) -> None:
         """Print what a finished file costs, against the scene as it was opened; of a box, within it."""
-        from sundae_ns.report.measure import cost_line
-
-        reference, name, crop = replace(self.scene, cameras=tuple(self.cameras)), "the whole scene", self.wishes.crop
-        if crop is not None:
+        reference, name = replace(self.scene, cameras=tuple(self.cameras)), "the whole scene"
+        if (crop := self.wishes.crop) is not None:
             reference, name = reference[crop_mask(reference, crop[:3], crop[3:])], "the scene in the box"
         if upright:
             reference = transform(reference, UPRIGHT[:, :3])
@@ -188,6 +187,7 @@ class Edit(NamedTuple):
 
 def opened(source: Path, wishes: Wishes, details: SceneDetails, *, capture: bool = False, most: int = 100) -> Edit:
     """A scene before its wishes, with up, start and cameras of its details; ``capture`` asks for ``most`` of a run."""
+    wishes.check_wishes()
     if details.preview is not None:
         if wishes.remove_floaters is None:
             raise ConfigError("--preview shows what --remove-floaters changes; add it")

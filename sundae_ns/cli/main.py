@@ -130,7 +130,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for name in ("stdout", "stderr"):
             if getattr(sys, name) is None:  # it is closed; else the next file that opens would get its number
                 setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
-            if isinstance(stream := getattr(sys, name), io.TextIOWrapper):  # names of files may be no text
+            stream = getattr(sys, name)
+            if isinstance(stream, io.TextIOWrapper):  # names of files may be no text
                 stream.reconfigure(errors="backslashreplace")
         # Looking for garbage among the million objects of imports takes a sixth of the start, and 0.6 s of the end.
         gc.set_threshold(100_000)

@@ -52,7 +52,6 @@ def pack(
         out: file to write, for example scene.sundae.
     """
     steps, target_drop, max_mb = advanced.finetune, advanced.target_drop, wishes.max_mb
-    wishes.check_wishes()
     check_exclusive(max_mb=max_mb, target_drop=target_drop)
     check_least(max_cameras=(advanced.max_cameras, 0), finetune=(steps, 0), target_drop=(target_drop, 0.001))
     if out.suffix.lower() in (*FORMATS, ".html"):
@@ -70,16 +69,18 @@ def pack(
     larger = None if max_mb is None else max_mb / (FINETUNED_SIZE if steps else 1)
     asked = before._replace(wishes=replace(wishes, max_mb=larger))
     left = asked.reduced(out.with_suffix(".sundae"), rounds=not steps)
-    source, packs = contents_of(left.stated), list[tuple[PackedScene, Codecs]]()
+    source = contents_of(left.stated)
+    packs: list[tuple[PackedScene, Codecs]] = []
     figures: dict[str, Any] = {}
     with progress_bar() as bar, redirect_stdout(StringIO()):  # nerfstudio's messages
         task = bar.add_task("Fine-tuning" if steps else "Packing", total=2 + steps)
         if kind is None:
             from sundae_ns.plugin.tuned_packs import Judge, Search, best_pack, finetune
 
-            judge, progress = cache(lambda: Judge(run, advanced.data)), lambda _: bar.advance(task)
+            judge = cache(lambda: Judge(run, advanced.data))
         if steps:
-            packs.append(finetune(run, source, FINETUNED, steps, data=advanced.data, progress=progress))
+            tuned = finetune(run, source, FINETUNED, steps, data=advanced.data, progress=lambda _: bar.advance(task))
+            packs.append(tuned)
         bar.update(task, description="Packing")
         if (steps and max_mb is not None) or target_drop is not None:
             # Starts from the source, because positions of a fitted pack are rounded.

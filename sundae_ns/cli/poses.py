@@ -18,7 +18,10 @@ from sundae_ns.cli.main import STEP
 from sundae_ns.cli.options import File, Input, Out, Plain, progress_bar, word
 from sundae_ns.cli.refusals import check_folder, check_least
 from sundae_ns.core.errors import ConfigError, DataError, SundaeError, one_line
+from sundae_ns.data import reconstruct
 from sundae_ns.data.capture_files import Placed
+from sundae_ns.data.photos import LEAST_PHOTOS, find_photos, left_out, masks_beside, masks_of
+from sundae_ns.data.video import SUFFIXES, check_video, is_video
 
 _warn = partial(print, "# warning:", flush=True)
 
@@ -45,11 +48,9 @@ def poses(photos: Input, out: Out, options: Plain[PoseOptions] = PoseOptions()) 
     """
     masks = check_poses(photos, options)
     check_folder(out, reads=[], outside=photos)
-    from sundae_ns.data.reconstruct import Request, find_poses, pycolmap
-
-    pycolmap()
-    request = Request(photos, out, options.matching, options.frames, masks)
-    placed = _interruptible(lambda: find_poses(request, _report, _warn), request.work)
+    reconstruct.pycolmap()
+    request = reconstruct.Request(photos, out, options.matching, options.frames, masks)
+    placed = _interruptible(lambda: reconstruct.find_poses(request, _report, _warn), request.work)
     counts = f"{len(placed.placed):,} of {placed.total:,} photos have a pose, of {placed.cameras} camera"
     print(f"{out}: {counts}{'s' * (placed.cameras > 1)}; mean reprojection error {placed.error:.2f} px")
     if others := ", ".join(f"{count:,}" for count in placed.models[1:]):
@@ -65,11 +66,7 @@ def poses(photos: Input, out: Out, options: Plain[PoseOptions] = PoseOptions()) 
 
 def check_poses(photos: Path, options: PoseOptions, *, remarks: bool = True) -> Path | None:
     """Check photos or a video by headers, print ``remarks``; the folder of masks, by default one beside the photos."""
-    from sundae_ns.data.photos import LEAST_PHOTOS, find_photos, left_out, masks_beside, masks_of
-    from sundae_ns.data.reconstruct import check_installed
-    from sundae_ns.data.video import SUFFIXES, check_video, is_video
-
-    check_installed()
+    reconstruct.check_installed()
     check_least(frames=(options.frames, LEAST_PHOTOS))
     warn: Callable[[str], object] = _warn if remarks else str
     if is_video(photos):

@@ -96,7 +96,8 @@ def _distilled(edit: Edit, out: Path, steps: int | None) -> int:
     wishes, details, scene = edit.wishes, edit.details, edit.scene.to(fastest_device())
     options: dict[str, Any] = {"keep": wishes.keep, "count": wishes.count, "steps": steps, "head": not details.no_head}
     options |= {"cameras": details.cameras and edit.cameras, "seed": details.seed or 0, "progress": True}
-    training, partial = Distillation(scene, **options), out.with_name(f"{out.name}.partial")
+    training = Distillation(scene, **options)
+    partial = out.with_name(f"{out.name}.partial")
     if partial.exists():
         training.load(partial)
         print(f"resuming after step {training.step:,} of {training.steps:,}, with {partial}", file=sys.stderr)

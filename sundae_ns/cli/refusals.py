@@ -71,5 +71,6 @@ def check_least(**values: tuple[float | None, float]) -> None:
 
 def check_exclusive(**values: object) -> None:
     """Raise ``ConfigError`` if more than one of the options is given."""
-    if len(given := [f"--{name.replace('_', '-')}" for name, value in values.items() if value is not None]) > 1:
+    given = [f"--{name.replace('_', '-')}" for name, value in values.items() if value is not None]
+    if len(given) > 1:
         raise ConfigError(f"{given[0]} and {given[1]} exclude each other; give one")

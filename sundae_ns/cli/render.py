@@ -42,7 +42,6 @@ def render(
     check_least(width=(width, 2))
     if fps is not None and not (video and 0 < fps <= 240):
         raise ConfigError("--fps is of a video, from above 0 to 240; leave it out, or name a video .mp4")
-    wishes.check_wishes()
     check_file(out, reads=[scene, advanced.cameras], overwrite=advanced.overwrite)
     edit = opened(scene, wishes, advanced, most=MOST_CAMERAS)
     views, speed = list(edit.scene.cameras), edit.speed

@@ -9,15 +9,17 @@ import shlex
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Literal, NamedTuple
+
+import torch
 
 from sundae_ns.cli.options import Hidden, Input, Out, Plain, word, words_of
 from sundae_ns.cli.poses import PoseOptions, check_poses
 from sundae_ns.cli.process import run_command
 from sundae_ns.cli.refusals import check_folder
-from sundae_ns.cli.train import TrainOptions, has_gpu, pack_run
+from sundae_ns.cli.train import TrainOptions, pack_run
 from sundae_ns.core.errors import STOPPED, ConfigError, DataError, StorageError, SundaeError
 from sundae_ns.core.files import put_aside, write_text
 from sundae_ns.data.capture_files import placed_in
@@ -72,7 +74,7 @@ class Project:
     @cached_property
     def tunes(self) -> bool:
         """Whether the pack is fine-tuned, which takes seconds on a GPU."""
-        return self.quality != "draft" and has_gpu() and not self.train.cleans
+        return self.quality != "draft" and torch.cuda.is_available() and not self.train.cleans
 
     def check(self) -> None:
         """Raise an error for photos that cannot be used, and for options that contradict each other."""
@@ -90,13 +92,11 @@ class Project:
     def plan(self) -> list[Step]:
         """The steps in their order; a capture needs no poses."""
         packed, report, page = (self.out / name for name in ("scene.sundae", "report/report.html", "scene.html"))
-        data, export = ("--data", word(self.capture)), ["sundae", "export", word(packed), "-o", word(page)]
+        data = ("--data", word(self.capture))
         compared = [word(self.run), *([] if self.train.crop else [word(packed)])]  # photos show what a box leaves out
         measure = ["sundae", "compare", *compared, *data, "-o", word(report.parent), "--overwrite"]
-
-        def pack() -> int:
-            return pack_run(self.run, packed, *data, *self.train.pack_words, finetune=self.tunes)
-
+        export = ["sundae", "export", word(packed), "-o", word(page)]
+        pack = partial(pack_run, self.run, packed, *data, *self.train.pack_words, finetune=self.tunes)
         rest = [
             Step("train", self._train, self._trained),
             Step("pack", pack, lambda: read_sections(packed, read_header(packed)), packed),
@@ -116,10 +116,11 @@ class Project:
             counts = f"COLMAP placed {len(placed.placed)} of {placed.total} photos"
             other = f"train on these with `sundae run {shlex.quote(word(self.capture))} -o OTHER`"
             raise DataError(f"{counts}; {placed.again}, and start in another folder, or {other}")
-        saved, options = self.run / "nerfstudio_models", self.train
         # The name may begin with a dash.
         more = [*self.more, f"--experiment-name={self.run.parent.parent.name}", "--timestamp", self.run.name]
         more += ["--vis", "viewer+tensorboard", "--viewer.websocket-host", "127.0.0.1"]
+        saved = self.run / "nerfstudio_models"
+        options = self.train
         if steps_left(self.run) is not None:
             more += ["--load-dir", word(saved)]
             options = replace(options, steps=None)
@@ -142,8 +143,8 @@ class Project:
 
     def claim(self) -> None:
         """Make the folder and lock it, or check that an earlier command with the same settings made it."""
-        path, given = self.out / SETTINGS, {"photos": self.photos, "quality": self.quality}
-        given |= {**asdict(self.train), **asdict(self.poses)}
+        path = self.out / SETTINGS
+        given = {"photos": self.photos, "quality": self.quality, **asdict(self.train), **asdict(self.poses)}
         settings = json.loads(json.dumps(given, default=lambda path: str(path.resolve())))
         settings |= settings.pop("advanced")
         # An earlier command may have been killed after it made the lock.

@@ -8,6 +8,8 @@ from importlib.metadata import entry_points
 from itertools import pairwise
 from pathlib import Path
 
+import torch
+
 from sundae_ns.cli.options import Advanced, Details, File, Flag, Input, Int, Out, Plain, Rest, Wishes, word, words_of
 from sundae_ns.cli.process import run_command
 from sundae_ns.cli.refusals import check_folder, check_least
@@ -119,7 +121,7 @@ def train(
         more[:0] = [f"--experiment-name={old.parent.parent.name}", "--load-dir", word(old / "nerfstudio_models")]
     if resume or given is None:
         more[:0] = ["--timestamp", name]
-    tunes = has_gpu()
+    tunes = torch.cuda.is_available()
     # Refuses a damaged capture before runs are mentioned.
     words = options.words(capture, out, more, tunes=tunes, masks=masks)
     if not resume and old is not None and not (old / PACKED).exists():
@@ -141,13 +143,6 @@ def pack_run(run: Path, out: Path, *more: str, finetune: bool) -> int:
             return code
         print(f"# the fine-tune ended with {code}; packing without it:")
     return run_command(words)
-
-
-def has_gpu() -> bool:
-    """Whether a GPU trains; imports torch, which takes a second."""
-    import torch
-
-    return torch.cuda.is_available()
 
 
 def _value_of(option: str, words: Sequence[str]) -> str | None:

@@ -78,7 +78,6 @@ def view(
         port: port on 127.0.0.1; 0 takes a free one.
         no_open_browser: only print the address, and open no browser.
     """
-    wishes.check_wishes()
     page = page_of(opened(scene, wishes, advanced, capture=True).for_page())
     with serve(page, port) as server, suppress(KeyboardInterrupt):
         address = f"http://127.0.0.1:{server.server_port}/"

@@ -36,5 +36,5 @@ def commands(colmap, monkeypatch):
     made = Commands()
     for module in ("run", "train"):
         monkeypatch.setattr(f"sundae_ns.cli.{module}.run_command", made)
-        monkeypatch.setattr(f"sundae_ns.cli.{module}.has_gpu", lambda: made.gpu)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: made.gpu)
     return made
