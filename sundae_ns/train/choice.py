@@ -150,10 +150,9 @@ def head_pays(curve: Sequence[CurvePoint], gain: HeadGain, tolerance: Tolerance)
     take fewer bytes in all. Gains count at the count that is kept with the head. The curve is without one.
     """
     kept, without = choose(with_head(curve, gain), tolerance), choose(curve, tolerance)
-    added, doublings = gain.bytes_of(kept), 0.0
     ours, theirs = _bytes_at(curve, kept), _bytes_at(curve, without)
-    if ours and theirs and added is not None:
-        doublings = math.log2((ours + added) / theirs)
+    added = gain.bytes_of(kept)
+    doublings = math.log2((ours + added) / theirs) if ours and theirs and added is not None else 0.0
     falls, gains = gain.falls_by(kept, HEAD_PSNR[1]), (gain.psnr, gain.ssim_db)
     return all(is_enough(gained * falls, gain.ssim, doublings) for gained in gains if gained is not None)
 

@@ -45,12 +45,12 @@ def read_count_curve(folder: Path) -> CountCurve | None:
 
     ``CheckpointError`` if the record is damaged.
     """
-    path, names = folder / RECORD, {entry.name for entry in fields(CurvePoint)}
+    path = folder / RECORD
     try:
         record = json.loads(regular(path).read_text(encoding="utf-8")).get("count")
         if record is None:
             return None
-        points = [{name: point[name] for name in names} for point in record["curve"]]
+        points = [{entry.name: point[entry.name] for entry in fields(CurvePoint)} for point in record["curve"]]
         # Infinite losses are stored as null, and unknown bytes too.
         if odd := [x for point in points for x in point.values() if x is not None and type(x) not in (int, float)]:
             raise TypeError(f"{odd[0]!r} is no number")

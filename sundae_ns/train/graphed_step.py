@@ -130,7 +130,8 @@ class StepRecordings:
     """
 
     def __init__(self, *, record: bool = True) -> None:
-        self._record, self._failed = record, False
+        self._record = record
+        self._failed = False
         self._recordings: OrderedDict[Hashable, _Recording] = OrderedDict()
         self._used: dict[Hashable, int] = {}  # Step at which a recording was last replayed
         self._steps = 0
@@ -207,10 +208,10 @@ class StepRecordings:
         self, work: StepWork, inputs: StepInputs, settings: RenderSettings, kind: Hashable, addresses: Hashable
     ) -> _Recording | None:
         """The recording of a kind of steps; None if it has to run kernel by kernel."""
-        if not self._record:
+        if not self._record or self._most_on_host is None:
             return None
-        assert self._most_on_host is not None
-        key, most = (kind, addresses), int(self._most_on_host)
+        key = (kind, addresses)
+        most = int(self._most_on_host)
         recording = self._recordings.get(key)
         if recording is None and len(self._recordings) >= MAX_RECORDINGS:
             oldest = next(iter(self._recordings))

@@ -122,21 +122,21 @@ class DenseStart(Callback):
     name = "dense-start"
 
     def __init__(self, options: Any, points: Points | None, num_images: int) -> None:
-        self._options, self._points = options, points
+        self._options = options
         wanted = 2 <= num_images <= options.dense_start_views and options.warm_start is None and not options.random_init
-        self._done = not wanted or points is None or len(points[0]) == 0
+        self._points = points if wanted and points is not None and len(points[0]) else None  # of a start to come
 
     def load_state_dict(self, state: TrainingState, saved: Mapping[str, Any]) -> None:
         """A field of a checkpoint is in training."""
-        self._done = True
+        self._points = None
 
     def before_training(self, run: TrainingRun) -> None:
         """Sweep, and put the larger field in the place of the one from sparse points."""
-        if self._done:
+        if self._points is None:
             return
-        self._done = True
-        assert self._points is not None
-        state, (sparse, colours) = run.state, self._points
+        sparse, colours = self._points
+        self._points = None
+        state = run.state
         too_many = state.device.type == "cpu" and len(run.view_indices()) > MOST_ON_CPU
         if too_many or len(sparse) >= by_device(FILLED, state.device):
             return

@@ -15,19 +15,17 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console
+
 
 class ConsoleHandler(logging.Handler):
     """Prints messages with their time, and warnings in yellow; no markup, because names of files may hold brackets."""
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print a message."""
-        from rich.console import Console
-
-        console, text = Console(width=120), self.format(record)
-        if record.levelno >= logging.WARNING:
-            console.print(f"Warning: {text}", style="yellow", markup=False, soft_wrap=True)
-        else:
-            console.print(f"[{time.strftime('%H:%M:%S')}] {text}", markup=False, soft_wrap=True)
+        warns = record.levelno >= logging.WARNING
+        text = f"{'Warning:' if warns else time.strftime('[%H:%M:%S]')} {self.format(record)}"
+        Console(width=120).print(text, style="yellow" if warns else None, markup=False, soft_wrap=True)
 
 
 def show_log() -> None:

@@ -160,7 +160,6 @@ def usual_share(num_views: int) -> float:
 def write_record(run: TrainingRun, name: str, record: Any) -> None:
     """Write a record as JSON to the run's folder, if there is one; numbers that are not finite become null."""
     if run.folder is not None:
-        run.folder.mkdir(parents=True, exist_ok=True)
         write_text(run.folder / name, json.dumps(without_nan(record), indent=2, allow_nan=False) + "\n")
 
 
@@ -199,9 +198,9 @@ def prune_to(
     device = pruner.params["means"].device
     before, started = pruner.total, now(device)
     dropped = pruner.drop_nonfinite()
-    count, weights = target(pruner.total), None
-    if rule.uses_contribution and count < pruner.total:
-        weights = contribute(count if rule.uses_detail else None)
+    count = target(pruner.total)
+    needs_views = rule.uses_contribution and count < pruner.total
+    weights = contribute(count if rule.uses_detail else None) if needs_views else None
     decision = pruner.cut(rule, count, weights)
     state.update(pruned_at=step, num_prunes=state["num_prunes"] + 1)
     report: dict[str, Any] = {"step": step, "before": before, "after": decision.kept, "dropped_nonfinite": dropped}
@@ -322,29 +321,29 @@ class FloaterRemoval(Callback):
     name = "floaters"
 
     def __init__(self, points: Tensor | None) -> None:
-        self._points, self._done = points, points is None
+        self._points = points  # None once floaters were removed
 
     def state_dict(self) -> dict[str, Any]:
         """Whether floaters were removed."""
-        return {"done": self._done}
+        return {"done": self._points is None}
 
     def load_state_dict(self, state: TrainingState, saved: Mapping[str, Any]) -> None:
         """Counterpart of :meth:`state_dict`; without points there is nothing to do."""
-        self._done = self._points is None or bool(saved.get("done"))
+        self._points = None if saved.get("done") else self._points
 
     def needs_all(self, run: TrainingRun) -> bool:
         """Whether this is the last step at which the field grows, so that a saved warm-up has no floaters."""
-        return not self._done and run.state.schedule_step + 1 >= run.state.densify_until
+        return self._points is not None and run.state.schedule_step + 1 >= run.state.densify_until
 
     def after_step(self, run: TrainingRun) -> None:
         """Remove floaters once."""
         state = run.state
-        if not self.needs_all(run):
+        points = self._points
+        if points is None or not self.needs_all(run):
             return
-        self._done = True
-        assert self._points is not None
+        self._points = None
         eyes = torch.stack([camera.center for camera, _ in run.training_views()])
         pruner = Pruner(state.gaussians, state.optimizers, [state.densification])
-        removed = pruner.drop(near_cameras(pruner.params["means"], eyes, self._points), at_most=MOST)
+        removed = pruner.drop(near_cameras(pruner.params["means"], eyes, points), at_most=MOST)
         if removed:
             _log.info(f"step {state.step}: removed {removed:,} floaters right in front of a camera")

@@ -215,11 +215,12 @@ def _leave_finetune(config: Any, done: int) -> None:
 
 def _resumed_run(config: Any, saved: Path) -> Any:
     """The configuration of the run that is resumed; None if it is not beside its checkpoints."""
-    run, path = None, find_config(saved)
+    path = find_config(saved)
     try:
         run = None if path is None else load_config(path)
     except CheckpointError as error:
         _log.warning(f"{error}; the run is resumed with the options of this command")
+        return None
     return run if isinstance(run, type(config)) else None
 
 

@@ -92,9 +92,9 @@ def view_quality(image: Tensor, target: Tensor, mask: Tensor | None) -> HeldOutQ
         return HeldOutQuality(0, 0.0, 0.0)
     # Outside of the mask the compared image is exact, so all of its error belongs to the pixels that count.
     compared = image if mask is None else torch.where(mask[..., None], image, target)
-    share, large = pixels / target[..., 0].numel(), min(target.shape[:2]) >= SSIM_WINDOW
+    share = pixels / target[..., 0].numel()
     decibels = float(psnr(compared, target)) + 10 * math.log10(share)
-    similarity = 1 - (1 - float(ssim(compared, target))) / share if large else 0.0
+    similarity = 1 - (1 - float(ssim(compared, target))) / share if min(target.shape[:2]) >= SSIM_WINDOW else 0.0
     return HeldOutQuality(pixels, min(decibels, MOST_PSNR), similarity)
 
 
@@ -303,7 +303,9 @@ class Trials(Callback):
 
     def start(self, run: TrainingRun, stage: str, length: int, views: list[int], width: int | None = None) -> None:
         """Start a trial from the present Gaussians, which may be dropped if a width of the features is given."""
-        state, self.progress.stage, self._mean = run.state, stage, RunningMean()
+        state = run.state
+        self.progress.stage = stage
+        self._mean = RunningMean()
         averaged = self._window if width is None else MEAN_SHARE * length
         self.trial = Trial(length, views, averaged, width, width is None, state.schedule_step)
         self.hold_out(run)
@@ -312,8 +314,8 @@ class Trials(Callback):
             return
         if state.widen_head(width):
             state.optimizers[HEAD].state.clear()
-            colors, generator = state.gaussians["features_dc"].detach(), torch.Generator().manual_seed(0)
-            features = initial_features(colors, width, generator)
+            generator = torch.Generator().manual_seed(0)
+            features = initial_features(state.gaussians["features_dc"].detach(), width, generator)
             replace_parameter(state.gaussians, state.optimizers, FEATURES, features, {})
         # Now: the callback that prunes acts before, so it would be a step later.
         notify_pruned(state.schedulers, state.step, run.source.total)
@@ -351,7 +353,8 @@ class Trials(Callback):
 
     def go_back(self, name: str, state: TrainingState) -> None:
         """Continue with a kept copy, its learning rates and its counted steps."""
-        kept, peak = self.kept[name], state.pruning["peak"]  # of all trials
+        kept = self.kept[name]
+        peak = state.pruning["peak"]  # of all trials
         state.restore(kept)
         state.pruning.update({**kept["pruning"], "peak": peak})
         self.taken_back = state.schedule_step - kept["counted"]
@@ -363,11 +366,6 @@ class Trials(Callback):
         self.coming.pop(stage, None)
         self.hold_out(run)
         self._apply(run.state)
-
-    def measure(self, run: TrainingRun) -> list[HeldOutQuality]:
-        """Quality of the held-out views with the mean of the weights, if there is one."""
-        with self._mean.applied(weights_of(run.state)):
-            return measure_held_out(run, with_fitted=self.progress.stage == "count")
 
     def _go_on(self, run: TrainingRun) -> None:
         """Once the current trial has ended, measure it; try the next candidate of the stage, or choose."""
@@ -385,7 +383,9 @@ class Trials(Callback):
         name = "plain" if enabled is None else "head"
         if enabled is not None and wide and enabled.config.num_features == MORE_FEATURES:
             name = "features"
-        row = Tried(stage, run.source.total, name, self.trial.length, [list(view) for view in self.measure(run)])
+        with self._mean.applied(weights_of(state)):
+            views = [list(view) for view in measure_held_out(run, with_fitted=stage == "count")]
+        row = Tried(stage, run.source.total, name, self.trial.length, views)
         progress.tried.append(row)
         if stage in ("count", "tenth"):
             row.bytes = packed_size(state.gaussians, enabled)
@@ -494,7 +494,8 @@ class Trials(Callback):
 
     def _set_count(self, run: TrainingRun, count: int) -> None:
         """End the trials of counts; with 0 the schedule keeps the usual share."""
-        self.progress.stage, self.progress.chosen["count"], run.state.pruning[COUNT] = "", count, count
+        self.progress.stage = ""
+        self.progress.chosen["count"] = run.state.pruning[COUNT] = count
         self.end(run, "count")
         if not self.decides_head:
             self.enable_head(run.state, True)
@@ -505,14 +506,14 @@ class Trials(Callback):
         return _steps_of(run) + run.state.offset > self.begins_at + trials * self._length
 
     def _begin_heads(self, run: TrainingRun) -> None:
-        chosen, state, trials = self.progress.chosen, run.state, len(self._heads) * len(self._folds)
-        if "tenth" in chosen:
-            head = "head" if chosen["tenth"] else "plain"
+        if "tenth" in self.progress.chosen:
+            head = "head" if self.progress.chosen["tenth"] else "plain"
             self._finish_with(run, head, "the trials of counts have shown what it gains")
             return
+        trials = len(self._heads) * len(self._folds)
         self._announce(run, "is the head worth it?", trials, self._length, sum(self._folds, []))
-        limit_rise(state.schedulers, round(RISE_SHARE * self._length))
-        self.keep("start", state, head=True)
+        limit_rise(run.state.schedulers, round(RISE_SHARE * self._length))
+        self.keep("start", run.state, head=True)
         self._start_head(run)
 
     def _start_head(self, run: TrainingRun) -> None:
@@ -560,7 +561,8 @@ class Trials(Callback):
         progress, state = self.progress, run.state
         # The chosen candidate has not seen these since before its trial.
         views = [] if progress.reason else self._folds[-1]
-        watched, num_views = int(WATCHED_SHARE * (progress.steps - state.schedule_step)), len(run.view_indices())
+        watched = int(WATCHED_SHARE * (progress.steps - state.schedule_step))
+        num_views = len(run.view_indices())
         # A warm start has learnt all views: what it forgets of them is no overfitting.
         if state.offset > 0 or not views or num_views >= MANY_VIEWS or watched < self._window:
             progress.chosen["length"] = None
