@@ -130,8 +130,7 @@ class StepRecordings:
     """
 
     def __init__(self, *, record: bool = True) -> None:
-        self._record = record
-        self._failed = False
+        self._record, self._failed = record, False
         self._recordings: OrderedDict[Hashable, _Recording] = OrderedDict()
         self._used: dict[Hashable, int] = {}  # Step at which a recording was last replayed
         self._steps = 0
@@ -210,8 +209,7 @@ class StepRecordings:
         """The recording of a kind of steps; None if it has to run kernel by kernel."""
         if not self._record or self._most_on_host is None:
             return None
-        key = (kind, addresses)
-        most = int(self._most_on_host)
+        key, most = (kind, addresses), int(self._most_on_host)
         recording = self._recordings.get(key)
         if recording is None and len(self._recordings) >= MAX_RECORDINGS:
             oldest = next(iter(self._recordings))

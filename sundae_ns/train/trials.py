@@ -353,8 +353,7 @@ class Trials(Callback):
 
     def go_back(self, name: str, state: TrainingState) -> None:
         """Continue with a kept copy, its learning rates and its counted steps."""
-        kept = self.kept[name]
-        peak = state.pruning["peak"]  # of all trials
+        kept, peak = self.kept[name], state.pruning["peak"]  # of all trials
         state.restore(kept)
         state.pruning.update({**kept["pruning"], "peak": peak})
         self.taken_back = state.schedule_step - kept["counted"]
@@ -366,6 +365,11 @@ class Trials(Callback):
         self.coming.pop(stage, None)
         self.hold_out(run)
         self._apply(run.state)
+
+    def measure(self, run: TrainingRun) -> list[HeldOutQuality]:
+        """Quality of the held-out views with the mean of the weights, if there is one."""
+        with self._mean.applied(weights_of(run.state)):
+            return measure_held_out(run, with_fitted=self.progress.stage == "count")
 
     def _go_on(self, run: TrainingRun) -> None:
         """Once the current trial has ended, measure it; try the next candidate of the stage, or choose."""
@@ -383,9 +387,7 @@ class Trials(Callback):
         name = "plain" if enabled is None else "head"
         if enabled is not None and wide and enabled.config.num_features == MORE_FEATURES:
             name = "features"
-        with self._mean.applied(weights_of(state)):
-            views = [list(view) for view in measure_held_out(run, with_fitted=stage == "count")]
-        row = Tried(stage, run.source.total, name, self.trial.length, views)
+        row = Tried(stage, run.source.total, name, self.trial.length, [list(view) for view in self.measure(run)])
         progress.tried.append(row)
         if stage in ("count", "tenth"):
             row.bytes = packed_size(state.gaussians, enabled)
