@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import torch
 from torch import Tensor
@@ -33,6 +33,8 @@ RESAMPLED = 3  # rounds that begin by drawing the even half anew, in proportion 
 EVENNESS = 4.0  # weight of the deviation of the angles beside their mean, for the half that sees all parts alike
 _PROBE_SIZE, _PROBES = 24, 64  # sides of the images that candidates are judged by, pixels, and images at once
 _PROBE_GAUSSIANS = 20_000  # most Gaussians of these images
+Rule = Literal["mean", "even", "cover"]  # of what a camera is judged by, see _coarseness
+_CHANNELS = {"mean": 1, "even": 2, "cover": 3}  # that a rule blends: the logarithm, its square, and the coverage
 # Of front views: azimuths and elevations, radians, and distances.
 _AROUND = [math.tau * i / 24 for i in range(24)], [0.0, 0.2, 0.45], [0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0]
 
@@ -67,19 +69,17 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
     n = whole(usual if n is None else n, "n", most=10_000)
     size = min(SIDE, max(64, 16 * math.isqrt(scene.num_gaussians))) if size is None else size
     gaussians = usable(scene)
-    middle, reach = middle_and_reach(gaussians)
     generator = torch.Generator().manual_seed(whole(seed, "seed", 0))
-    probe, sizes = _probe(gaussians, middle, reach, generator)
-    judge = dataclasses.replace(scene, gaussians=probe)
+    probe, sizes, middle, reach = _probe(scene, gaussians, generator)
     normal = partial(torch.randn, generator=generator, dtype=torch.float64)
 
     def random_targets(count: int) -> Tensor:
         drawn = torch.randint(gaussians.num_gaussians, (count,), generator=generator)
         return (gaussians["means"][drawn.to(scene.device)].cpu().double() - middle) / reach
 
-    def climb(n: int, moments: int) -> tuple[Tensor, Tensor]:  # eyes and targets of n cameras
+    def climb(n: int, rule: Rule) -> tuple[Tensor, Tensor]:  # eyes and targets of n cameras
         def best_of(eyes: Tensor, targets: Tensor) -> tuple[Tensor, Tensor, Tensor]:  # those n apart, and coarseness
-            coarseness = _coarseness(judge, sizes, eyes, targets, moments).view(-1, n)
+            coarseness = _coarseness(probe, sizes, eyes, targets, rule).view(-1, n)
             best = coarseness.argmin(dim=0) * n + torch.arange(n)
             return eyes[best], targets[best], coarseness.amin(dim=0)
 
@@ -88,7 +88,7 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
         eyes = direction * NEAREST * (FARTHEST / NEAREST) ** share
         eyes, targets, coarseness = best_of(eyes, random_targets(FIRST * n))
         for done in range(ROUNDS):
-            if moments == 2 and done < RESAMPLED:
+            if rule == "even" and done < RESAMPLED:
                 chances = (-coarseness.double()).softmax(dim=0)
                 points = torch.arange(n, dtype=torch.float64) + torch.rand(1, generator=generator, dtype=torch.float64)
                 drawn = torch.searchsorted(chances.cumsum(0), points / n).clamp_max(n - 1)
@@ -102,9 +102,9 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
             coarseness = torch.where(better, moved_coarseness, coarseness)
         return eyes, targets
 
-    eyes, targets = climb(n - n // 2, 1)
+    eyes, targets = climb(n - n // 2, "mean")
     if n > 1:
-        even, _ = climb(n // 2, 2)
+        even, _ = climb(n // 2, "even")
         # In turns, so that the first few are of both kinds.
         turns = torch.cat([torch.arange(len(eyes)) * 2, torch.arange(len(even)) * 2 + 1]).argsort()
         eyes = torch.cat([eyes, even])[turns]
@@ -121,16 +121,14 @@ def front_views(scene: Scene, n: int = 7) -> list[Camera]:
 
     The first sees most of the scene, by the smallest and most equal Gaussians; a page opens with it.
     """
-    gaussians = usable(scene)
-    middle, reach = middle_and_reach(gaussians)
-    probe, sizes = _probe(gaussians, middle, reach, torch.Generator().manual_seed(0))
+    probe, sizes, middle, reach = _probe(scene, usable(scene), torch.Generator().manual_seed(0))
     up = torch.tensor(scene.up or (0.0, 0.0, 1.0), dtype=torch.float64)
     turn, rise, away = torch.cartesian_prod(*(up.new_tensor(values) for values in _AROUND)).T
     around = torch.stack([turn.cos() * rise.cos(), turn.sin() * rise.cos(), rise.sin()]) * away
     eyes = (poses_looking_at(up, torch.zeros_like(up), up)[:, :3] @ around).T
-    judge = dataclasses.replace(scene, gaussians=probe)
-    best, each = int(_coarseness(judge, sizes, eyes, torch.zeros_like(eyes), 3).argmin()), len(eyes) // len(_AROUND[0])
-    places = [middle + reach * eyes[(best + side * each) % len(eyes)] for side in (0, 1, -1, 2, -2, 3, -3)]
+    best = int(_coarseness(probe, sizes, eyes, torch.zeros_like(eyes), "cover").argmin())
+    step = len(eyes) // len(_AROUND[0])  # from one azimuth to the next
+    places = [middle + reach * eyes[(best + side * step) % len(eyes)] for side in (0, 1, -1, 2, -2, 3, -3)]
     return [Camera.look_at(eye, middle, up, fov=50, width=640, height=480) for eye in places[:n]]
 
 
@@ -139,7 +137,8 @@ def of_unit_size(scene: Scene, cameras: Sequence[Camera]) -> tuple[Scene, list[C
 
     The size is the median distance of the Gaussians from their middle; 1 for nerfstudio's model, which stays as it is.
     """
-    size, scaled = 1.0 if scene.in_model_frame else middle_and_reach(usable(scene))[1], list[Camera]()
+    size = 1.0 if scene.in_model_frame else middle_and_reach(usable(scene))[1]
+    scaled: list[Camera] = []
     for camera in cameras:
         viewmat = camera.viewmat.clone()
         viewmat[:3, 3] /= size
@@ -180,8 +179,9 @@ def usable(scene: Scene) -> Gaussians:
     return Gaussians({name: value.detach() for name, value in gaussians.items()}, gaussians.encoding)
 
 
-def _probe(gaussians: Gaussians, middle: Tensor, reach: float, generator: torch.Generator) -> tuple[Gaussians, Tensor]:
-    """Few Gaussians of a scene of unit size, grown to cover the others, and logarithms of their own sizes ``[M]``."""
+def _probe(scene: Scene, gaussians: Gaussians, generator: torch.Generator) -> tuple[Scene, Tensor, Tensor, float]:
+    """Few of the finite ``gaussians`` at unit size, grown to cover all; logarithms of sizes ``[M]``; middle, reach."""
+    middle, reach = middle_and_reach(gaussians)
     sizes = gaussians["scales"].double().sort(dim=1).values[:, 1:].mean(dim=1) - math.log(reach)
     kept = gaussians
     if gaussians.num_gaussians > _PROBE_GAUSSIANS:
@@ -193,7 +193,7 @@ def _probe(gaussians: Gaussians, middle: Tensor, reach: float, generator: torch.
         kept = kept.replaced({"scales": kept["scales"] - chance[drawn].log().to(kept["scales"])[:, None] / 2})
     moved = (kept["means"].double() - middle.to(kept["means"].device)) / reach
     values = {"means": moved.float(), "scales": kept["scales"] - math.log(reach)}
-    return kept.replaced(values), sizes.float()
+    return dataclasses.replace(scene, gaussians=kept.replaced(values)), sizes.float(), middle, reach
 
 
 def _factor(values: Tensor, count: int) -> Tensor:
@@ -204,10 +204,10 @@ def _factor(values: Tensor, count: int) -> Tensor:
 
 
 @torch.no_grad()
-def _coarseness(scene: Scene, sizes: Tensor, eyes: Tensor, targets: Tensor, moments: int) -> Tensor:
-    """Mean logarithm of the angle of the Gaussians in the pixels ``[V]``, of 2 moments with its deviation.
+def _coarseness(scene: Scene, sizes: Tensor, eyes: Tensor, targets: Tensor, rule: Rule) -> Tensor:
+    """Logarithm of the angle of the Gaussians in the pixels ``[V]``: its ``mean``; ``even`` adds its deviation.
 
-    With 3 only covered pixels count, and a view gains by their number, as by more Gaussians, and by centres in it.
+    ``cover`` does too, of covered pixels; a view gains by their number, as by more Gaussians, and by centres in it.
     """
     means, settings = scene.gaussians["means"], scene.settings(head=False)
     coarseness: list[Tensor] = []
@@ -219,16 +219,16 @@ def _coarseness(scene: Scene, sizes: Tensor, eyes: Tensor, targets: Tensor, mome
         distances = (means - eyes[some, None]).norm(dim=2).clamp_min(1e-9)
         angles = (sizes - distances.log()).clamp_max(0)
         # Blending adds nothing where nothing is seen: the logarithm of one radian.
-        powers = torch.stack([angles, angles.square(), torch.ones_like(angles)][:moments], dim=-1)
+        powers = torch.stack([angles, angles.square(), torch.ones_like(angles)][: _CHANNELS[rule]], dim=-1)
         probes = dataclasses.replace(inputs, colors=powers)
         images = rasterize_cameras(probes, viewmats[some], camera.K.expand(len(powers), 3, 3), backend=settings.backend)
         mean, *others = images.mean(dim=(1, 2)).unbind(dim=1)
-        if moments == 3:
+        if rule == "cover":
             covered = others.pop().clamp_min(1e-6)
             mean, others = mean / covered, [others[0] / covered]
         for square in others:
             mean = mean + EVENNESS * (square - mean.square()).clamp_min(0).sqrt()
-        if moments == 3:
+        if rule == "cover":
             x, y, z = (viewmats[some, :3, :3] @ means.T + viewmats[some, :3, 3:]).unbind(dim=1)
             inside = torch.maximum(x.abs(), y.abs()) < z * math.tan(math.radians(FOV / 2))
             mean = mean - (covered.log() + inside.float().mean(dim=1)) / 2
