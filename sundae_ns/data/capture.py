@@ -40,12 +40,12 @@ def side(value: Any, name: str, where: str) -> int:
 
 def matrix(value: Any, rows: Sequence[int], name: str, where: str) -> np.ndarray:
     """``value`` as a finite, regular float64 matrix ``[R, 4]`` with R one of ``rows``; ``DataError`` if it is none."""
-    listed = isinstance(value, list) and len(value) in rows
-    if not listed or not all(isinstance(row, list) and len(row) == 4 for row in value):
+    table = np.array(value, object)  # of whatever the file holds
+    if table.shape[1:] != (4,) or len(table) not in rows:
         raise DataError(f"{where}: {name} must have {' or '.join(map(str, rows))} rows of 4 numbers; correct the file")
-    for entry in sum(value, []):
+    for entry in table.flat:
         finite(entry, name, where)
-    array = np.array(value, np.float64)
+    array = table.astype(np.float64)
     if abs(np.linalg.det(array[:3, :3])) < 1e-9:
         raise DataError(f"{where}: {name} is singular, so it is not a camera pose; remove this view")
     return array
@@ -63,9 +63,8 @@ def rigid(pose: np.ndarray, where: str) -> np.ndarray:
 
 def read_json(path: Path, *, slashes: bool = True) -> dict[str, Any]:
     """The JSON object of a file, with ``slashes`` in Windows paths; ``DataError`` if it cannot be read or is none."""
-    with reading(path, "JSON", remedy="write it again"):
-        with regular(path).open("rb") as file:
-            text = file.read(_MOST_BYTES + 1)
+    with reading(path, "JSON", remedy="write it again"), regular(path).open("rb") as file:
+        text = file.read(_MOST_BYTES + 1)
         if len(text) > _MOST_BYTES or sum(map(text.count, b"[{:")) > 2_000_000:
             raise DataError(f"{path} has more than 32 MB, or two million lists and entries; split it")
         content = json.loads(text.replace(rb"\\", b"/" if slashes else rb"\\"))
@@ -106,7 +105,8 @@ def check_transforms(path: Path, *, splits: Sequence[str] = ()) -> dict[str, Any
     listed = [split for split in ("train", "val", "test") if f"{split}_filenames" in meta]
     known = {str(Path(frame["file_path"])) for frame in frames}
     for split in splits if listed else ():
-        files = meta.get(name := f"{split}_filenames")
+        name = f"{split}_filenames"
+        files = meta.get(name)
         if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
             remedy = f"add {name} as a list of paths, or remove all such lists"
             raise DataError(f"{path.name} lists images for {', '.join(listed)}, but none for {split}; {remedy}")
@@ -158,7 +158,8 @@ def check_first_image(path: Path, meta: Mapping[str, Any], factor: int) -> None:
     stated = {**meta, **meta["frames"][0]}
     image, small = path.parent / stated["file_path"], path.parent / f"images_{factor}"
     if factor == 1 or small.exists():
-        if not (image := image if factor == 1 else small / image.name).exists():
+        image = image if factor == 1 else small / image.name
+        if not image.exists():
             raise DataError(f"{image} does not exist{beside(image)}; correct file_path in {path.name}")
         return
     made = ", ".join(["1", *(entry.name[7:] for entry in entries(path.parent) if entry.name.startswith("images_"))])

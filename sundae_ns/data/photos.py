@@ -139,16 +139,17 @@ def photo_of(path: Path) -> Photo:
                 return Photo(path, ".jpg", size[::-1] if raw.sizes.flip in (5, 6) else size, False, (RAW,))
         size = images.check_image(path)
         with images.opened(path) as image:
-            kind, alpha, exif = str(image.format), image.has_transparency_data, image.getexif()
-            orientation, lens, srgb = images.orientation_in(image), _lens(exif), images.is_srgb(image)
+            kind = str(image.format)
+            suffix = _COPIED.get(kind, ".png" if image.has_transparency_data else ".jpg")
+            orientation = images.orientation_in(image)
+            as_it_is = kind in _COPIED and orientation == 1 and images.is_srgb(image)
+            lens = _lens(image.getexif())
             told = f"{image.info.get('xmp')} {lens}".upper()
             kind_of_model(next((key for key in ("EQUIRECTANGULAR", "CYLINDRICAL") if key in told), "OPENCV"), str(path))
     if kind not in (*_COPIED, *_CONVERTED):
         raise DataError(f"{path} is a {kind} file by its contents; save it as JPEG or PNG, or remove it")
     check_shape(path, size)
-    suffix = _COPIED.get(kind, ".png" if alpha else ".jpg")
-    size = size[::-1] if orientation in images.TURNED else size
-    return Photo(path, suffix, size, kind in _COPIED and orientation == 1 and srgb, lens)
+    return Photo(path, suffix, size[::-1] if orientation in images.TURNED else size, as_it_is, lens)
 
 
 def _opened_raw(path: Path) -> Any:

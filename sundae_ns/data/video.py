@@ -9,6 +9,8 @@ from itertools import chain, groupby
 from pathlib import Path
 from typing import Any
 
+import av
+import cv2
 import numpy as np
 from PIL import Image
 
@@ -36,7 +38,8 @@ def is_video(path: Path) -> bool:
 
 def check_video(path: Path, warn: Warn = str) -> None:
     """Raise ``DataError`` if a video cannot be decoded, has too few frames, or colours that cannot be converted."""
-    (length, aspect, tracks), first = _facts(path), next(_frames(path), None)
+    length, aspect, tracks = _facts(path)
+    first = next(_frames(path), None)
     if first is None:
         raise DataError(f"{path} has no frame that can be decoded; {_CONVERT}")
     if length < LEAST_PHOTOS:
@@ -48,7 +51,9 @@ def check_video(path: Path, warn: Warn = str) -> None:
 
 def write_frames(path: Path, folder: Path, count: int, advance: Callable[[int], None]) -> None:
     """Write the sharpest frame of each of ``count`` stretches of a video to a folder, which appears at the end."""
-    partial, written, (length, aspect, _) = folder.with_name(f"{folder.name}.partial"), 0, _facts(path)
+    length, aspect, _ = _facts(path)
+    partial = folder.with_name(f"{folder.name}.partial")
+    written = 0
     with writing(f"cannot write {folder}"):
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
@@ -91,8 +96,6 @@ def image_of(frame: Any, path: Path, aspect: float = 1.0) -> Image.Image:
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, list[Any]]]:
     """The container and its videos, the one to read first."""
-    import av
-
     with reading(path, "a video that FFmpeg decodes", remedy=_CONVERT, missing=_CONVERT):
         # Titles of old files are not in UTF-8.
         with av.open(str(regular(path).absolute()), options=_OPTIONS, metadata_errors="replace") as container:
@@ -110,8 +113,6 @@ def _opened(path: Path) -> Iterator[tuple[Any, list[Any]]]:
 
 def _frames(path: Path) -> Iterator[Any]:
     """The frames that can be decoded, deinterlaced."""
-    import av
-
     graph: Any = None
 
     def filtered(frame: Any) -> Iterator[Any]:
@@ -156,8 +157,6 @@ def _sharpest(path: Path, count: int, length: int) -> Iterator[Any]:
 
 def sharpness(frame: Any) -> float:
     """Variance of the Laplacian of a frame's grey values, at a width of at most 960 pixels."""
-    import cv2
-
     width = min(frame.width, 960)
     grey = frame.reformat(width, max(1, frame.height * width // frame.width), "gray", interpolation="AREA")
     return float(cv2.Laplacian(grey.to_ndarray(), cv2.CV_64F).var())
