@@ -69,7 +69,8 @@ class CheckedDataset(InputDataset):
                 orientation = exif_orientation(path)
                 if orientation not in TURNED or self._scaled(full[::-1]) != expected:
                     raise wrong_size(path, full, (expected[0], expected[1]), orientation)
-                self.turned[index], full = orientation, full[::-1]
+                self.turned[index] = orientation
+                full = full[::-1]
             if mask is not None and check_image(mask, mask=True) != full:
                 raise DataError(f"{mask} differs in size from its image {path.name}; make it {full[0]} x {full[1]} px")
             if mask is not None and (turn := exif_orientation(mask)) != 1 and turn != exif_orientation(path):
@@ -166,8 +167,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             few = f"{parser.data} has {count or 'no'} training image{'s' * (count != 1)}, and training needs 2 or more"
             raise DataError(f"{few}; check the path and the split (--eval-mode)")
         check_cameras(outputs.cameras, outputs.image_filenames, outputs.metadata.get("points3D_xyz"))
-        folder, is_colmap = self.config.capture, isinstance(parser, ColmapDataParserConfig)
-        folder = folder.parent if folder.is_file() else folder
+        is_colmap = isinstance(parser, ColmapDataParserConfig)
+        folder = self.config.capture.parent if self.config.capture.is_file() else self.config.capture
         if outputs.mask_filenames is None and (masks := unused_masks(folder)) is not None:
             how = f"colmap --masks-path {masks} (sundae train: --masks)" if is_colmap else "mask_path in each frame"
             _log.warning(f"{folder / masks} is not used; to leave out what its masks hide, give {how}")

@@ -240,8 +240,8 @@ class Distillation:
 
     def load(self, path: Path) -> None:
         """Continue from a file of :meth:`save`; ``CheckpointError`` if it is damaged, or of other options or scene."""
-        state, kind = self.state, "a checkpoint of this scene and these options"
-        with reading(path, kind, CheckpointError, remedy="remove it to start anew"):
+        state = self.state
+        with reading(path, "a checkpoint of this scene and options", CheckpointError, remedy="remove it to start anew"):
             saved = torch.load(path, map_location=state.device, weights_only=True)
             if saved["options"] != self._options:
                 raise ValueError("other options")

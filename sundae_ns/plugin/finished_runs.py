@@ -120,15 +120,16 @@ def load_model(
 
 def _in_views_of(like: Opened, path: Path, scene: Scene) -> Opened:
     """A file in the test views of another scene; of the model's and the capture's coordinates, those that fit."""
-    device, subset = like.model.device, slice(None, None, len(like.cameras) // 4 + 1)
+    device = like.model.device
+    subset = slice(None, None, len(like.cameras) // 4 + 1)
     scene = replace(scene, background_color=like.model.config.background_color)
     if not scene.in_model_frame:  # which few formats state
         matrix, scale = like.datamanager.train_dataset.metadata[DATASET_FRAME]
         moved = transform(scene, matrix[:, :3], scale, scale * matrix[:, 3])
         views = like.truths[subset], [like.model.camera_of(camera) for camera in like.cameras[subset]]
         scene = max((scene, moved), key=lambda each: measure(each.to(device), *views).psnr)
-    model, size = model_of(scene).to(device), path.stat().st_size
-    opened = replace(like, model=model, source=path, variant=path.name, packed_bytes=size)
+    model = model_of(scene).to(device)
+    opened = replace(like, model=model, source=path, variant=path.name, packed_bytes=path.stat().st_size)
     return replace(opened, method="", steps=0, kept=None, seed=None, prune_s=None, pipeline=None)
 
 

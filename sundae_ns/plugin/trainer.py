@@ -99,8 +99,6 @@ class SundaeTrainerConfig(TrainerConfig):
         if self.machine.num_devices > 1:
             distributed.check_options(self)
         path = self.get_base_dir() / "config.yml"
-        with writing(f"cannot make {path.parent} for --output-dir"):
-            path.parent.mkdir(parents=True, exist_ok=True)
         run_folder.reserve(path.parent)
         CONSOLE.log(f"Saving config to: {path}")
         write_text(path, yaml.dump(self))
