@@ -44,7 +44,8 @@ def render(
         raise ConfigError("--fps is of a video, from above 0 to 240; leave it out, or name a video .mp4")
     check_file(out, reads=[scene, advanced.cameras], overwrite=advanced.overwrite)
     edit = opened(scene, wishes, advanced, most=MOST_CAMERAS)
-    views, speed = list(edit.scene.cameras), edit.speed
+    views = list(edit.scene.cameras)
+    speed = edit.speed
     if (seconds is not None and (speed is not None or not video)) or (video and view is not None):
         raise ConfigError("--seconds is the length of a film without a camera path, --view of an image; leave it out")
     if not video and view is None and (advanced.start_view is not None or advanced.cameras is None):

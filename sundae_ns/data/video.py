@@ -52,8 +52,7 @@ def check_video(path: Path, warn: Warn = str) -> None:
 def write_frames(path: Path, folder: Path, count: int, advance: Callable[[int], None]) -> None:
     """Write the sharpest frame of each of ``count`` stretches of a video to a folder, which appears at the end."""
     length, aspect, _ = _facts(path)
-    partial = folder.with_name(f"{folder.name}.partial")
-    written = 0
+    partial, written = folder.with_name(f"{folder.name}.partial"), 0
     with writing(f"cannot write {folder}"):
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
