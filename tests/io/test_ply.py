@@ -231,7 +231,7 @@ WRONG = {
     "Student's t": (_with("nu_degree"), "Gaussians of another kernel .nu_degree."),
     "Brush's 4D": (_header(b"end_header", b"element delta_vertex_0 0\nproperty uchar x\nend_header"), "holds 4D"),
     "Scaffold-GS": (_with("scale_3", "f_anchor_feat_0", without="f_"), "network for its colours .f_anchor_feat_0."),
-    "SH in channels": (_with("sh_0_r", without="f_"), "harmonics by other names .sh_0_r.; export them as f_dc_0"),
+    "a long name": (_with("sh_coef" + 60_000 * "1" + "-", without="f_"), "harmonics by other names .sh_coef1+.; exp"),
     "harmonics of a checkpoint": (_with("features_rest_0", without="f_rest"), "by other names .features_rest_0."),
     "features for colours": (_with("color_feature_0", without="f_"), "a network for its colours"),
     "codes": (_columns(lambda c: c | {"rot_2": np.zeros(7, np.uint8)}), "has codes of a table for rot_2"),
