@@ -12,28 +12,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from sundae_ns.core.errors import CheckpointError, ConfigError, SundaeError
+from sundae_ns.core.errors import CheckpointError, ConfigError
 from sundae_ns.core.metrics import Quality, evaluate
 from sundae_ns.core.values import usual_defaults
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.io.pack.codecs import Codecs, estimated_bits
-from sundae_ns.io.pack.config import COARSEST, FINEST, PackConfig, scaled
+from sundae_ns.io.pack.config import COARSEST, FINEST, FINETUNED, PackConfig, scaled
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
 from sundae_ns.plugin.finished_runs import load_model, put_gaussians
 from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.plugin.optimizer_configs import optimise, rate_factor
 from sundae_ns.rasterize.gsplat_kernels import Capacity
 from sundae_ns.scene.cameras import spread
-from sundae_ns.scene.prune_scene import largest
+from sundae_ns.scene.prune_scene import LEAST, largest
 from sundae_ns.scene.render import RenderSettings
 from sundae_ns.train.choice import GAIN_PER_DOUBLING
 from sundae_ns.train.graphed_step import StepRecordings
@@ -44,6 +43,7 @@ RATES = {"features_dc": 5e-4, "features_rest": 1e-4, "opacities": 1e-2, "scales"
 RATES |= {"quats": 2e-4, "features": 5e-4, "head": 2e-4}
 """Peak rates of Adam, about a fifth of the initial rates of a run. Positions are rounded once and fixed: at the end of
 training they hardly move."""
+Tuned = tuple[PackedScene, Codecs]
 RATE = 0.025  # Loss for each bit per stored number: about what a bit less costs in quality at the steps of FINETUNED
 
 
@@ -56,7 +56,7 @@ def finetune(
     *,
     data: Path | None = None,
     progress: Callable[[Tensor], object] = lambda _: None,
-) -> tuple[PackedScene, Codecs]:
+) -> Tuned:
     """Train the Gaussians and head of a run with the rounding of its pack in the loop. The run is only read.
 
     ``scene`` is the same run, from ``scene.packing.contents_of``; the trained one and its codecs are returned.
@@ -97,6 +97,17 @@ def finetune(
         meta={**scene.meta, "source": {**scene.meta.get("source", {}), "finetuned": steps}},
     )
     return trained, codecs.to(torch.device("cpu"))
+
+
+def finetune_within(run: Path, scene: PackedScene, steps: int, most: int | None, **options: Any) -> Tuned:
+    """As :func:`finetune` with the usual bits; again with others if those take more than ``most`` bytes, or fewer."""
+    first = finetune(run, scene, FINETUNED, steps, **options)
+    if most is None or LEAST * most <= len(pack_bytes(*first)[0]) <= most:
+        return first
+    power = largest(float, lambda power: pack_at(first[0], FINETUNED, power).bytes, most)
+    again = finetune(run, scene, scaled(FINETUNED, power), steps, **options)
+    found = largest(partial(pack_at, *again), lambda pack: pack.bytes, most)
+    return found.scene, found.codecs
 
 
 class RoundedTraining:
@@ -205,6 +216,16 @@ class Candidate(NamedTuple):
     bytes: int
 
 
+def pack_at(scene: PackedScene, fit: PackConfig | Codecs, power: float) -> Candidate:
+    """The pack of a scene at a factor of 2^power, with ``fit`` as of :class:`Search`."""
+    if isinstance(fit, PackConfig):
+        scene, codecs = fit_scene(scene, scaled(fit, power))
+    else:
+        config = scaled(fit.config, power, with_positions=False)
+        codecs = fit.with_steps(config, scene.gaussians, scene.head) if power else fit
+    return Candidate(scene, codecs, len(pack_bytes(scene, codecs)[0]))
+
+
 class Search:
     """Packs of one scene at several factors, judged by the run's test views; ``ConfigError`` if none meets a limit.
 
@@ -221,28 +242,13 @@ class Search:
 
     def at(self, power: float) -> Candidate:
         """The pack at a factor of 2^power."""
-        if isinstance(self._fit, PackConfig):
-            scene, codecs = fit_scene(self.scene, scaled(self._fit, power))
-        else:
-            scene, codecs = self.scene, self._fit
-            if power:
-                config = scaled(codecs.config, power, with_positions=False)
-                codecs = codecs.with_steps(config, scene.gaussians, scene.head)
-        return Candidate(scene, codecs, len(pack_bytes(scene, codecs)[0]))
+        return pack_at(self.scene, self._fit, power)
 
     def drop(self, candidate: Candidate) -> float:
         """PSNR of a pack below the run's on some test views, dB; infinite for images that are not finite."""
         judge = self._judge()
         drop = judge.before.psnr - judge.quality(candidate.scene, candidate.codecs).psnr
         return drop if math.isfinite(drop) else math.inf
-
-    def smaller_than(self, limit: int) -> Candidate:
-        """The finest pack of at most ``limit`` bytes; that at the factor 1 if it fits and, by chance, loses less."""
-        finest = largest(self.at, lambda candidate: candidate.bytes, limit)
-        with suppress(SundaeError):  # sizes need no capture
-            if self.default.bytes <= limit and self.drop(self.default) < self.drop(finest):
-                return self.default
-        return finest
 
     def better_than(self, limit: float) -> Candidate:
         """The coarsest pack that loses at most ``limit`` dB, no larger than that at the factor 1 if this one fits."""
@@ -262,22 +268,14 @@ class Search:
         return self.default if first >= 0 and self.default.bytes <= best.bytes else best
 
 
-def best_pack(searches: Sequence[Search], *, most_bytes: int | None = None, most_drop: float = 0.0) -> Candidate:
-    """The pack that loses least in at most ``most_bytes``, or else the smallest that loses at most ``most_drop`` dB.
-
-    The searches are of one run, the preferred one last; ``ConfigError`` if none meets the limit.
-    """
-    packs, failure = list[tuple[Search, Candidate]](), ConfigError("there is no pack")
-    for search in searches if most_bytes is not None else reversed(searches):
+def best_pack(searches: Sequence[Search], most_drop: float) -> Candidate:
+    """The smallest pack that loses at most ``most_drop`` dB, of searches of one run; ``ConfigError`` if none does."""
+    packs, failure = list[Candidate](), ConfigError("there is no pack")
+    for search in reversed(searches):
         try:
-            pack = search.better_than(most_drop) if most_bytes is None else search.smaller_than(most_bytes)
-            packs.append((search, pack))
+            packs.append(search.better_than(most_drop))
         except ConfigError as error:
             failure = error
     if not packs:
         raise failure
-    if most_bytes is None:
-        return min((pack for _, pack in packs), key=lambda pack: pack.bytes)
-    with suppress(SundaeError):  # sizes need no capture
-        return min(packs, key=lambda pair: pair[0].drop(pair[1]))[1]
-    return packs[-1][1]
+    return min(packs, key=lambda pack: pack.bytes)

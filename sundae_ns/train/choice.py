@@ -276,11 +276,6 @@ def affordable(curve: Sequence[CurvePoint], most: int) -> int | None:
     return max(int(math.exp((size - start) / max(slope, 0.1))), 1)
 
 
-def still_climbs(curve: Sequence[CurvePoint], tolerance: Tolerance) -> bool:
-    """Whether the largest count is the best and the next smaller one clearly worse: more Gaussians might help."""
-    return len(curve) > 1 and excess(curve[0], tolerance) <= 0 and excess(curve[1], tolerance) > 1
-
-
 def loss_of(views: Sequence[HeldOutQuality], ssim_weight: float) -> float:
     """The loss of training after the prune: root of the mean squared error, and SSIM, which rises for longer."""
     psnr, ssim = mean_quality(views)

@@ -8,7 +8,8 @@ pay:
     the first step: many Gaussians remember for long what they have seen once. Few views decide by their number alone:
     what they would tell is less than what the training loses without them.
 ``tenth``
-    If more than the usual share is chosen, that share is trained without and with a head: there it gains the sooner.
+    If more than the usual share is chosen, or bytes are limited, that share is trained without and with a head: there
+    it gains the sooner.
 ``head``
     Whether training goes on plain, with a head, or with one of more features (``head.mode auto``), unless ``tenth`` has
     told. Where views are few or differ, a head fits their differences. The chosen trial goes on.
@@ -56,6 +57,7 @@ _log = logging.getLogger(__name__)
 SHARES: tuple[float, ...] = (1.0, 0.4, 0.2, 0.1, 0.05, 0.025)  # Of the Gaussians that are tried
 COUNT_SHARE = 0.02  # Length of a trial of a count, and of a window of a length, as a share of the schedule
 FEWEST_VIEWS = 6  # Fewer cannot judge a head
+LARGEST_HEAD = 2.0  # Stored bytes of a head as a multiple of those of a pack, where an eighth of it takes a quarter
 MOST_CONTRIBUTING = 32  # Training views that the prune of a trial looks at
 MOST_TRIALS = 0.45  # Largest share of the steps after the prune that trials of counts, and of a head in them, may take
 MEAN_SHARE = 0.25  # Share of a trial, at its end, over which weights are averaged
@@ -232,7 +234,7 @@ class Trials(Callback):
     def before_training(self, run: TrainingRun) -> None:
         """Hold views out; decide at once where trials cannot."""
         progress, state, indices = self.progress, run.state, run.view_indices()
-        num_views, several = len(indices), run.images_per_step > 1
+        num_views, several, max_bytes = len(indices), run.images_per_step > 1, self.config.max_bytes or math.inf
         # A warm start skips the steps before the prune.
         progress.steps = progress.steps or (run.schedule_length or 0) + state.offset
         self._window = max(round(COUNT_SHARE * progress.steps), 1)
@@ -259,6 +261,8 @@ class Trials(Callback):
             if several:  # also if one GPU has begun them: its copies are of all Gaussians
                 wide = state.head is not None and state.head.config.num_features == MORE_FEATURES
                 self._finish_with(run, "features" if wide else "head", "trials need a single GPU")
+            elif state.head is not None and stored_bytes({}, state.head.config) >= LARGEST_HEAD * max_bytes:
+                self._finish_with(run, "plain", "in a pack it would take a quarter of pruning.max-bytes")
             elif num_views < FEWEST_VIEWS:
                 self._finish_with(run, "plain", f"{num_views} training views are too few to tell whether a head helps")
             elif progress.stage != "head" and "head" not in self.coming and not self._heads_fit(run):
@@ -422,7 +426,7 @@ class Trials(Callback):
         self.progress.full = run.source.total
         self._announce(run, "how many Gaussians does the scene need?", len(SHARES), self._window, self._judges)
         self.enable_head(state, False)
-        self.keep("start", state, head=self.decides_head)
+        self.keep("start", state, head=self.decides_head and state.head is not None)
         self._try_count(run)
 
     def _try_count(self, run: TrainingRun) -> None:
@@ -433,13 +437,15 @@ class Trials(Callback):
             progress.chosen["tenth"] = choice.head_pays(curve, HeadGain.of(*tenth), self._tolerance)
             curve = self.curve()
         usual = kept_count(USUAL_SHARE, progress.full)
+        # The count within a limit of bytes depends on those of the head.
+        tries_head = self.decides_head and state.head is not None
         promising = number == 0 or (curve and not choice.is_lost(curve[-1], self._tolerance))
         if progress.stage != "tenth" and number < len(SHARES) and promising:
             count, length = kept_count(SHARES[number], progress.full), self._window
             self._prune(run, count)
             notify_pruned(state.schedulers, state.step, count, last=False, ends_at=state.step + length)
             self.start(run, "count", length, self._judges, width=0)
-        elif self.decides_head and curve and len(tenth) < 2 and self._count_of(curve)[0] > usual:
+        elif tries_head and curve and len(tenth) < 2 and (self.config.max_bytes or self._count_of(curve)[0] > usual):
             self._prune(run, usual)
             limit_rise(state.schedulers, round(RISE_SHARE * self._length))
             notify_pruned(state.schedulers, state.step, usual, last=False)
@@ -474,9 +480,6 @@ class Trials(Callback):
         self._set_count(run, count)
         _log.info("\n".join(["expected at the end, on held-out training views:", *curve_table(curve)]))
         _log.info(f"keeping {count:,} of {progress.full:,} Gaussians: {reason}")
-        if choice.still_climbs(curve, self._tolerance):
-            more = "a lower --pipeline.model.densify-grad-thresh makes more Gaussians, which the scene may need"
-            _log.info(f"quality still grows at the full count: {more}")
         run.log_scalars("Curve", {"chosen": count, "full": progress.full})
         record: dict[str, Any] = {"chosen": count, "full": progress.full, "reason": reason, "step": run.state.step}
         record |= {"tolerance": self._tolerance._asdict(), "held_out_views": self._judges}

@@ -328,13 +328,16 @@ def test_with_few_views_two_are_held_out_in_turn(make, judge_heads):
     assert second not in watched
 
 
-def test_with_too_few_views_the_head_stays_off(make, capsys):
-    trainer = make(5, max_num_iterations=1)
+@pytest.mark.parametrize("views", [5, VIEWS])
+def test_with_too_few_views_or_bytes_the_head_stays_off(make, capsys, views):
+    limited = PruningConfig(keep_ratio=None, max_bytes=9999)
+    trainer = make(views, max_num_iterations=1, model={} if views == 5 else {"pruning": limited})
     trainer.train()
-    assert trainer.pipeline.model.head is None
     reason = "5 training views are too few to tell whether a head helps"
+    reason = reason if views == 5 else "in a pack it would take a quarter of pruning.max-bytes"
+    assert trainer.pipeline.model.head is None
     assert records_of(trainer)["head"] == {"decision": "plain", "reason": reason, "step": 0}
-    assert "the head is removed: 5 training views are too few" in " ".join(capsys.readouterr().out.split())
+    assert f"the head is removed: {reason}" in " ".join(capsys.readouterr().out.split())
 
 
 def test_masks_that_leave_no_pixel_leave_no_head(make, judge_heads, monkeypatch):

@@ -28,7 +28,6 @@ def test_where_no_count_is_best_in_both_figures_the_one_that_loses_least_is_take
     losses = [(0.5, 0), (0, 0.006), (0.5, 0.03), (1, 0.1)]
     assert choose([point(n, *loss) for n, loss in zip((1000, 400, 200, 100), losses, strict=True)], Tolerance()) == 400
     assert choose([point(100), point(50)], Tolerance()) == 50
-    assert not choice.still_climbs([point(100, 0.5 * Tolerance().psnr), point(50, 9)], Tolerance()), "not the best"
 
 
 def test_a_budget_in_bytes_is_in_proportion_to_the_one_size_that_is_known():

@@ -36,7 +36,6 @@ def count_choice(measured: Mapping[str, Any], options: Mapping[str, Any]) -> dic
         "asks_for_head": choice.choose_within(plain, tolerance, **limits)[0] > tenth,
         "head_pays": pays,
         "lost": [choice.is_lost(point, tolerance) for point in plain],
-        "climbs": choice.still_climbs(curve, tolerance),
         "curve": [asdict(point) for point in curve],
     }
 

@@ -17,6 +17,7 @@ from sundae_ns.pruning.decision import Pruner
 from sundae_ns.train.initialize import Start
 from sundae_ns.train.pruning import (
     COUNT,
+    PACKED_BYTES,
     UNPRUNED,
     PruningConfig,
     ScheduledPruning,
@@ -228,6 +229,9 @@ def test_trials_decide_how_many_stay_and_the_prune_waits_for_them():
         assert config.due(decided, 3, 60)
         assert config.target(60, decided) == kept
     assert (config.target(5, {**UNPRUNED, COUNT: 7}), config.target(60, UNPRUNED)) == (5, 6)
+    # Without trials the bytes of a Gaussian are those of other captures.
+    limited = PruningConfig(keep_ratio=None, max_bytes=4 * PACKED_BYTES)
+    assert [limited.target(60, {**UNPRUNED, COUNT: chosen}) for chosen in (7, 0)] == [7, 4]
     shares = [usual_share(views) for views in (1, 7, 12, 13, 24, 31, 32, 99)]
     assert shares == pytest.approx([0.05, 0.05, 0.05, 0.13 / 2.4, 0.1, 0.31 / 2.4, 0.1, 0.1])
 
