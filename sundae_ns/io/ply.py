@@ -172,7 +172,7 @@ def keep_vertices(
         names, table = _table(params)
         kept = {name: kind[name] for name in kind.names or () if name in names or not name.startswith("f_rest_")}
         rows = rows[[*kept]].astype([*kept.items()])
-        line = rb"(?i)[\r\n]+[ \t]*property\s+\w+\s+(f_rest_\d+)"
+        line = rb"(?i)(?:\r\n|\r|\n)[ \t]*property\s+\w+\s+(f_rest_\d+)"
         header = re.sub(line, lambda m: m[0] * (m[1].decode().lower() in kept), header)
         for name, column in zip(names, table.T, strict=True):
             rows[name] = column
@@ -183,7 +183,7 @@ def keep_vertices(
             rows[name] = 0
     known = up is None or math.dist(up, ply_marks(source).up or (0, 0, 0)) < 1e-6
     line = b"" if known else rb"comment %s\g<1>" % comments_of(Marks(up=up))[0].encode()
-    vertex, new = rb"(?i)([\r\n]+)([ \t]*element\s+vertex\s+)\S+", rb"\g<1>%s\g<2>%d" % (line, len(rows))
+    vertex, new = rb"(?i)(\r\n|\r|\n)([ \t]*element\s+vertex\s+)\S+", rb"\g<1>%s\g<2>%d" % (line, len(rows))
     with replacing(out) as partial, partial.open("wb") as target, source.open("rb") as original:
         original.seek(len(file.header))
         target.writelines((re.sub(vertex, new, header, count=1), original.read(start - len(file.header)), rows.data))
