@@ -88,9 +88,7 @@ class FakeColmap:
         self._check("import")
         self.write(path, {**self.read(path), "images": names})
 
-    def extract_features(
-        self, path: Path, images: Path, names: list[str], mode: str, reader: Any, options: Any
-    ) -> None:
+    def extract_features(self, path: Path, images: Path, names: list[str], *_: Any) -> None:
         self._check("features" if self.calls["features"] else "")
         self.calls["features"] += names
         stored = self.read(path)
