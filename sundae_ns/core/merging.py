@@ -31,7 +31,7 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
     """
     source = {name: value.detach() for name, value in params.items()}
     device = source["means"].device
-    label, w = label.to(device), weight.detach().to(device).double().nan_to_num(0.0, posinf=0.0).clamp_min(0)
+    label = label.to(device)
     stays = label == torch.arange(len(label), device=device)
     members = (label >= 0).nonzero().squeeze(1)
     group = (stays.cumsum(0) - 1)[label[members]]
@@ -50,7 +50,7 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
     def of(name: str, rows: slice) -> Tensor:
         return source[name][members[rows]].double()
 
-    w = w[members]
+    w = weight.detach().to(device).double().nan_to_num(0.0, posinf=0.0).clamp_min(0)[members]
     # Divide by the largest weight of the group first, so that no sum underflows.
     largest = w.new_zeros(count).scatter_reduce_(0, group, w, "amax")
     w = torch.where(largest[group] > 0, w / largest[group], 0.0)

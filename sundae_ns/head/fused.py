@@ -211,8 +211,7 @@ def bias_of(conv: nn.Conv2d) -> Tensor:
 
 def image_like(like: Tensor, channels: int, rows: int, columns: int, dtype: torch.dtype | None = None) -> Tensor:
     """An uninitialised image ``[1, channels, rows, columns]``, channels last."""
-    shape, dtype = (1, channels, rows, columns), dtype or like.dtype
-    return torch.empty(shape, dtype=dtype, device=like.device, memory_format=torch.channels_last)
+    return like.new_empty(1, rows, columns, channels, dtype=dtype).permute(0, 3, 1, 2)
 
 
 def pixel_stride(image: Tensor) -> int:

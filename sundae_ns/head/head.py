@@ -110,9 +110,10 @@ class CompensationHead(nn.Module):
             raise ConfigError("head.mode is off, which is no compensation head; choose residual or features")
         self.config = config
         # The residual head sees the colours and the accumulation beside the features.
-        residual, (width, most) = config.mode == "residual", SIZES[config.size]
-        channels, fold = config.num_features + (4 if residual else 0), config.pixel_unshuffle
-        self.net = UNet(channels, 3, width, max_width=most, pixel_unshuffle=fold, zero_init=residual)
+        residual = config.mode == "residual"
+        channels = config.num_features + (4 if residual else 0)
+        width, most = SIZES[config.size]
+        self.net = UNet(channels, 3, width, max_width=most, pixel_unshuffle=config.pixel_unshuffle, zero_init=residual)
         self.net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._can_fuse = True
         # Listed once, because every frame asks for the addresses and a walk over all layers takes 0.1 ms.

@@ -74,8 +74,7 @@ def decide(
     n, n_finite = len(finite), usable.num_gaussians
     if n_finite == 0:
         raise diverged(n)
-    count = min(count, n_finite)
-    if count == n_finite:
+    if count >= n_finite:
         return Decision(finite, n_finite, n - n_finite, values=dict(usable) if sanitised.clamped else None)
 
     if contribution is not None:
@@ -83,7 +82,8 @@ def decide(
             raise DataError(f"contribution has shape {list(contribution.shape)} for {n} Gaussians: return [{n}]")
         contribution = contribution.detach()[finite.to(contribution.device)].to(finite.device)
     graph = (graph or gaussian_graph(usable, rule)) if rule.uses_graph else None
-    scores, labels = score(usable, rule, graph, contribution), None
+    scores = score(usable, rule, graph, contribution)
+    labels = None
     if rule.selection == "pairs":
         assert graph is not None
         labels = pair_labels(usable, graph, scores, count)
