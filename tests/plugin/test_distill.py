@@ -74,7 +74,7 @@ def test_a_head_is_kept_where_it_pays_and_a_resumed_training_ends_alike(pays, ba
     assert second.train(lambda *_: True)
     for name, value in result.gaussians.items():
         assert torch.equal(value, second.result().gaussians[name]), name
-    with pytest.raises(CheckpointError, match="of this scene and these options .other options.; remove it"):
+    with pytest.raises(CheckpointError, match="of this scene and options .other options.; remove it"):
         begun(keep=0.2).load(tmp_path / "partial")
     (tmp_path / "partial").write_bytes(b"nothing")
     with pytest.raises(CheckpointError, match="partial is not a checkpoint"):
