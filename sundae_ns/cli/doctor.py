@@ -98,10 +98,8 @@ def _checked(name: str, check: Callable[[], str | None], remedy: str, purpose: s
     found, problem = None, "not found"
     try:
         found = check()
-    except metadata.PackageNotFoundError:
-        problem = "not installed"
-    except SundaeError as error:
-        problem = str(error)
+    except (SundaeError, metadata.PackageNotFoundError) as error:
+        problem = str(error) if isinstance(error, SundaeError) else "not installed"
     return Part(name, bool(found), (found or problem) + (f", for {purpose}" if purpose else ""), remedy)
 
 

@@ -67,8 +67,7 @@ def pack(
     before = opened(run, wishes, advanced, capture=True, most=advanced.max_cameras)
     # A fine-tune shrinks the file; by up to a quarter more, coarser steps lose less than fewer Gaussians.
     larger = None if max_mb is None else max_mb / (0.75 * FINETUNED_SIZE if steps else 1)
-    asked = before._replace(wishes=replace(wishes, max_mb=larger))
-    left = asked.reduced(out.with_suffix(".sundae"), rounds=not steps)
+    left = before._replace(wishes=replace(wishes, max_mb=larger)).reduced(out.with_suffix(".sundae"), rounds=not steps)
     source = contents_of(left.stated)
     packs: list[tuple[PackedScene, Codecs]] = []
     most = None if max_mb is None else int(max_mb * MEGABYTE)

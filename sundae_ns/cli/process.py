@@ -92,8 +92,7 @@ def run_logged(words: Sequence[str], log: Path | None = None, on_line: Callable[
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
-    if received:
-        code = 128 + received[0]
+    code = 128 + received[0] if received else code
     return code if code >= 0 else 128 - code, "\n".join(last)
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import torch
 import tyro
 
 from sundae_ns.cli.inputs import Edit, opened
@@ -16,7 +18,7 @@ from sundae_ns.core.errors import ConfigError
 from sundae_ns.pruning.rule import PruneRule, ScoreName
 from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.scene.compose import LEAST_SEEN, OTHERS
-from sundae_ns.scene.load_save import SUFFIXES, save
+from sundae_ns.scene.load_save import SUFFIXES
 
 
 @dataclass
@@ -61,7 +63,7 @@ def prune(
     """
     wishes.check_wishes(target_drop=target_drop)
     check_least(target_drop=(target_drop, 0.001))
-    check_exclusive(distill=distill or None, max_mb=wishes.max_mb, target_drop=target_drop)
+    check_exclusive(distill=distill or None, target_drop=target_drop)
     with_head = check_suffix(out, SUFFIXES) in (".sundae", ".html")
     if advanced.steps is not None and not distill:
         raise ConfigError("--steps belongs to --distill; add it, or leave them out")
@@ -93,11 +95,16 @@ def _distilled(edit: Edit, out: Path, steps: int | None) -> int:
     from sundae_ns.plugin.distill import Distillation  # imports nerfstudio, which takes seconds
     from sundae_ns.train.progress import Interruption
 
-    wishes, details, scene = edit.wishes, edit.details, edit.scene.to(fastest_device())
-    options: dict[str, Any] = {"keep": wishes.keep, "count": wishes.count, "steps": steps, "head": not details.no_head}
+    details, wishes, scene = edit.details, edit.wishes, edit.scene.to(fastest_device())
+    count, partial = wishes.count, out.with_name(f"{out.name}.partial")
+    sized = edit._replace(wishes=Wishes(max_mb=wishes.max_mb))
+    if wishes.max_mb is not None:
+        count = len(sized.reduced(out).scene)
+        with suppress(Exception):  # a resumed training has its own count; below, a damaged one is refused
+            count = torch.load(partial, map_location="cpu", weights_only=True)["options"]["counts"][1]
+    options: dict[str, Any] = {"keep": wishes.keep, "count": count, "steps": steps, "head": not details.no_head}
     options |= {"cameras": details.cameras and edit.cameras, "seed": details.seed or 0, "progress": True}
     training = Distillation(scene, **options)
-    partial = out.with_name(f"{out.name}.partial")
     if partial.exists():
         training.load(partial)
         print(f"resuming after step {training.step:,} of {training.steps:,}, with {partial}", file=sys.stderr)
@@ -116,10 +123,11 @@ def _distilled(edit: Edit, out: Path, steps: int | None) -> int:
             said = f"saved step {training.step:,} of {training.steps:,} as {partial}; the same command resumes"
         print(f"sundae: interrupted; {said}", file=sys.stderr)
         return 130
-    result = training.result()
-    save(result, out)
+    rows = torch.ones(training.state.gaussians.num_gaussians, dtype=torch.bool)
+    left = sized._replace(source=partial, scene=training.result(), rows=rows).reduced(out)
+    left.write(out)
     partial.unlink(missing_ok=True)
-    print(f"{out}: {len(result):,} of {len(scene):,} Gaussians, {'with' if result.head else 'without'} a head")
-    if training.gain is not None:
-        print(f"a head gained {training.gain:.2f} dB in its trial, on cameras that no step sees")
+    gain = training.gain and f"; it gained {training.gain:.2f} dB in its trial, on cameras that no step sees"
+    kept = f"{len(left.scene):,} of {len(scene):,} Gaussians, {'with' if left.scene.head else 'without'} a head"
+    print(f"{out}: {kept}{gain or ''}")
     return 0

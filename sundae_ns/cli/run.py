@@ -30,7 +30,6 @@ from sundae_ns.io.pack.container import read_header, read_sections
 from sundae_ns.io.run_folder import LOCK, reserve, steps_left
 
 SETTINGS = "run.json"  # file with the settings of the first command; a repeated one must share them
-LOG = "train.log"  # file with all output of ns-train
 DRAFT_STEPS = 3000
 
 
@@ -133,7 +132,7 @@ class Project:
                 more += ["--pipeline.model.pruning.max-drop", "0.03"]
         masks = self.poses.masks if self.posed else None
         words = options.words(self.capture, self.out / "runs", more, tunes=self.tunes, masks=masks)
-        return run_command(words, self.out / LOG)
+        return run_command(words, self.out / "train.log")
 
     def _trained(self) -> bool:
         """Whether the last step is saved, of those before the pack's fine-tune."""

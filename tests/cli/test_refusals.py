@@ -45,7 +45,6 @@ REFUSALS = {
     "prune trained -o a.ply": "trained is a folder of 3DGS; give trained/point_cloud/iteration_30000/point",
     "prune in.ply -o b.ply --distill": "b.ply cannot hold a head; name it .sundae, or leave",
     "prune in.ply -o b.sundae --distill --steps 0": "steps is 0; give a whole number, at least 1",
-    "prune in.ply -o b.sundae --distill --max-mb 1": "--distill and --max-mb exclude each other",
     "prune in.ply -o b.html --max-mb 0.01": "a file without Gaussians has",
     "prune in.ply -o b.ply --start-view 0": ".ply files hold no start view; leave it out, or name a .sundae or .html",
     "export in.ply -o a.splat": "name it .ply, .spz, .sog, .glb, .html",

@@ -12,7 +12,7 @@ from colmap_models import write_model
 from PIL import Image
 from run_commands import config_of, write_run
 
-from sundae_ns.cli.train import methods
+from sundae_ns.cli.train import METHODS
 from sundae_ns.io.run_folder import LOCK, unfinished_run
 
 
@@ -20,7 +20,7 @@ def train(*words):
     return command_line.run("train", *words)
 
 
-@pytest.mark.parametrize("method", methods())
+@pytest.mark.parametrize("method", METHODS)
 def test_the_printed_command_runs(commands, capsys, method):
     assert train("scene", "-o", "my runs", "--method", method, "--steps", "700", "--keep", "0.05") == 0
     assert shlex.split(capsys.readouterr().out.splitlines()[0]) == commands.ran[0]
