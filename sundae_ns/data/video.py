@@ -79,7 +79,7 @@ def image_of(frame: Any, path: Path, aspect: float = 1.0) -> Image.Image:
         raise DataError(f"{path} has {what}, which is not read; convert it to BT.709, for example with HandBrake")
     is_wide = transfer in HIGH_RANGE or primaries in PRIMARIES
     size = round(frame.width * max(aspect, 1.0)), round(frame.height / min(aspect, 1.0))
-    options = {"src_colorspace": matrix, "src_color_range": int(frame.color_range)}
+    options = {"src_colorspace": matrix, "src_color_range": int(frame.color_range), "threads": 1}  # more may fail
     pixels = frame.reformat(*size, "rgb48le" if is_wide else "rgb24", **options).to_ndarray()
     pixels = to_srgb_values(pixels, transfer, primaries) if is_wide else pixels
     for data in frame.side_data:
@@ -157,5 +157,5 @@ def _sharpest(path: Path, count: int, length: int) -> Iterator[Any]:
 def sharpness(frame: Any) -> float:
     """Variance of the Laplacian of a frame's grey values, at a width of at most 960 pixels."""
     width = min(frame.width, 960)
-    grey = frame.reformat(width, max(1, frame.height * width // frame.width), "gray", interpolation="AREA")
+    grey = frame.reformat(width, frame.height * width // frame.width or 1, "gray", interpolation="AREA", threads=1)
     return float(cv2.Laplacian(grey.to_ndarray(), cv2.CV_64F).var())
