@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import tyro
 from sundae_ns.cli.inputs import Edit, opened
 from sundae_ns.cli.options import Advanced, Flag, Float, Int, Out, Plain, Scene, SceneDetails, Wishes, progress_bar
 from sundae_ns.cli.refusals import check_exclusive, check_file, check_least, check_suffix
-from sundae_ns.core.errors import ConfigError
+from sundae_ns.core.errors import CheckpointError, ConfigError, reading
 from sundae_ns.pruning.rule import PruneRule, ScoreName
 from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.scene.compose import LEAST_SEEN, OTHERS
@@ -98,10 +97,11 @@ def _distilled(edit: Edit, out: Path, steps: int | None) -> int:
     details, wishes, scene = edit.details, edit.wishes, edit.scene.to(fastest_device())
     count, partial = wishes.count, out.with_name(f"{out.name}.partial")
     sized = edit._replace(wishes=Wishes(max_mb=wishes.max_mb))
-    if wishes.max_mb is not None:
-        count = len(sized.reduced(out).scene)
-        with suppress(Exception):  # a resumed training has its own count; below, a damaged one is refused
+    if wishes.max_mb is not None and partial.exists():  # on a GPU a search may not repeat itself
+        with reading(partial, "a checkpoint of this scene", CheckpointError, remedy="remove it to start anew"):
             count = torch.load(partial, map_location="cpu", weights_only=True)["options"]["counts"][1]
+    elif wishes.max_mb is not None:
+        count = len(sized.reduced(out).scene)
     options: dict[str, Any] = {"keep": wishes.keep, "count": count, "steps": steps, "head": not details.no_head}
     options |= {"cameras": details.cameras and edit.cameras, "seed": details.seed or 0, "progress": True}
     training = Distillation(scene, **options)
