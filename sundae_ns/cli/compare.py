@@ -26,7 +26,7 @@ from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.report.measure import against_first, against_photos, csv_text, labels_of, markdown, measure
 from sundae_ns.report.report_page import ShownRun, report_page, shown_views
 from sundae_ns.scene.describe import HELD_OUT, held_out_cameras
-from sundae_ns.scene.load_save import load, save
+from sundae_ns.scene.load_save import load, no_scene, save
 from sundae_ns.train.curve import read_count_curve
 
 
@@ -61,8 +61,8 @@ def compare(
     if out is not None:
         check_folder(out, reads=[*scenes, data, cameras], overwrite=overwrite)
     check_least(repeats=(repeats, 0), num_cameras=(num_cameras, 1))
-    if gone := next((path for path in scenes if not path.exists()), None):
-        raise ConfigError(f"{gone} does not exist; check the path")
+    if missing := next((path for path in scenes if not path.exists()), None):
+        raise no_scene(missing)
     scenes = sorted(scenes, key=lambda path: not is_run(path))  # a run says how photos are read
     photos = cameras is None and (data is not None or any(map(is_run, scenes)))
     if len(scenes) < (1 if photos or formats else 2):
@@ -73,15 +73,16 @@ def compare(
     command = shlex.join(["sundae", *typed])
     repeats = (5 if photos else 0) if repeats is None else repeats
     lpips = Lpips(lpips_net) if photos and lpips_weights(lpips_net)[1].is_file() else None
-    missing = f"LPIPS: the weights of its net ({lpips_net}) are missing; sundae doctor says where to put them."
-    notes = [missing] if photos and lpips is None else []
-    done, failures = list[ShownRun](), list[SundaeError]()
+    unmeasured = f"LPIPS: the weights of its net ({lpips_net}) are missing; sundae doctor says where to put them."
+    notes = [unmeasured] if photos and lpips is None else []
+    done: list[ShownRun] = []
+    failures: list[SundaeError] = []
     measured_by = partial(measure, lpips=lpips, repeats=repeats, command=command)
     with progress_bar() as progress, TemporaryDirectory() as folder:
         if formats:
             source = open_run(scenes[0], max_cameras=100, data=data) if is_run(scenes[0]) else load(scenes[0])
-            others = (other for other in (*FORMATS, ".sundae") if other != scenes[0].suffix.lower())
-            scenes += [Path(folder, scenes[0].stem + other) for other in others]
+            suffixes = (suffix for suffix in (*FORMATS, ".sundae") if suffix != scenes[0].suffix.lower())
+            scenes += [Path(folder, scenes[0].stem + suffix) for suffix in suffixes]
         opened = against_photos(data)
         if first is not None:
             chosen, _ = chosen_cameras(first, cameras, num_cameras)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from enum import Enum
 from functools import cache
@@ -18,7 +18,7 @@ import yaml
 from yaml.constructor import ConstructorError
 
 from sundae_ns.core.errors import CheckpointError, reading, regular
-from sundae_ns.io.formats import refuse
+from sundae_ns.io.formats import PRIMITIVES, kind_of, unread
 
 _PATHS = {"PosixPath", "WindowsPath", "PurePosixPath", "PureWindowsPath"}
 _GROUPS = ("nerfstudio.method_configs", "nerfstudio.dataparser_configs")
@@ -35,6 +35,11 @@ def _trusted_packages() -> frozenset[str]:
     return frozenset({"nerfstudio", "sundae_ns", "gsplat", "torch"} | {name.partition(".")[0] for name in plugins})
 
 
+def _refused(node: yaml.Node, reason: str) -> ConstructorError:
+    """The error for what a configuration may not hold, and its place in the file."""
+    return ConstructorError(None, None, reason, node.start_mark)
+
+
 def _named(name: str, node: yaml.Node) -> Any:
     """The class or function of a dotted name, which a trusted package must define."""
     module, _, attribute = name.rpartition(".")
@@ -44,20 +49,20 @@ def _named(name: str, node: yaml.Node) -> Any:
             value = getattr(importlib.import_module(module), attribute, None)
     home = str(getattr(value, "__module__", "")).partition(".")[0]
     if home not in _trusted_packages() or not isinstance(value, (type, FunctionType)):
-        raise ConstructorError(None, None, f"it names {name}", node.start_mark)
+        raise _refused(node, f"it names {name}")
     return value
 
 
 def _make_object(loader: _ConfigLoader, suffix: str, node: yaml.Node) -> Iterator[Any]:
     kind = _named(suffix, node)
     if not isinstance(kind, type) or not dataclasses.is_dataclass(kind) or not isinstance(node, yaml.MappingNode):
-        raise ConstructorError(None, None, f"{suffix} is no configuration", node.start_mark)
+        raise _refused(node, f"{suffix} is no configuration")
     made = kind.__new__(kind)
     yield made
     state = loader.construct_mapping(node, deep=True)
     # Setting a configuration up calls its target.
     if not isinstance(state.get("_target", type), type):
-        raise ConstructorError(None, None, f"the target of {suffix} is no class", node.start_mark)
+        raise _refused(node, f"the target of {suffix} is no class")
     for option in dataclasses.fields(kind):  # options newer than the run
         if option.name not in state and option.default_factory is not dataclasses.MISSING:
             state[option.name] = option.default_factory()
@@ -73,7 +78,7 @@ def _make_value(loader: _ConfigLoader, suffix: str, node: yaml.Node) -> Any:
     by_name = suffix == "builtins.getattr"  # as Python before 3.11.4 saves a member of an enumeration
     kind, *value = arguments if by_name and arguments else (_named(suffix, node), *arguments)
     if not isinstance(kind, type) or not issubclass(kind, Enum) or len(value) != 1:
-        raise ConstructorError(None, None, f"it asks to call {suffix}", node.start_mark)
+        raise _refused(node, f"it asks to call {suffix}")
     return kind.__members__[value[0]] if by_name else kind(value[0])
 
 
@@ -115,15 +120,15 @@ def load_config(path: Path) -> Any:
     ``CheckpointError`` if it cannot be read, or asks for more than classes of nerfstudio, of this package, of torch,
     and of installed plug-ins.
     """
-    config = _read(path, lambda text: yaml.load(text, Loader=_ConfigLoader))
+    config = _read(path, _ConfigLoader)
     find_capture(config, path.absolute().parent)
     return config
 
 
-def _read(path: Path, parse: Callable[[str], Any]) -> Any:
+def _read(path: Path, loader: type[yaml.SafeLoader]) -> Any:
     remedy = "give the folder of a finished run, or its config.yml"
     with reading(path, "a run's config.yml, or of another version", CheckpointError, remedy=remedy, missing=remedy):
-        return parse(regular(path).read_text(encoding="utf-8"))
+        return yaml.load(regular(path).read_text(encoding="utf-8"), Loader=loader)
 
 
 class _ValueLoader(yaml.SafeLoader):
@@ -141,7 +146,7 @@ _ValueLoader.add_multi_constructor(_PYTHON, _make_plain)
 
 def _value(path: Path, *keys: str) -> Any:
     """A plain value of a ``config.yml``, or None; ``CheckpointError`` if the file cannot be read."""
-    value = _read(path, lambda text: yaml.load(text, Loader=_ValueLoader))
+    value = _read(path, _ValueLoader)
     for key in keys:
         value = value.get(key) if isinstance(value, dict) else None
     return value
@@ -178,6 +183,11 @@ def schedule_length(path: Path) -> int:
 
 def check_run(run: Path) -> None:
     """``CheckpointError`` for a path that is no run, nor its ``config.yml``, before the slow import of nerfstudio."""
-    advice = "give the folder of a run; sundae prune and sundae export read such files"
-    refuse(run, packed="give the run that was packed", primitives=advice)
+    if (kind := kind_of(run)) == "packed":
+        raise CheckpointError(f"{run} is a packed scene; give the run that was packed")
+    if kind is not None:
+        advice = "give the folder of a run; sundae prune and sundae export read such files"
+        raise CheckpointError(f"{run} is a {PRIMITIVES[kind]}; {advice}")
+    if (reason := unread(run)) is not None:
+        raise CheckpointError(f"{run} {reason}")
     model_options(config_of(run))

@@ -89,16 +89,6 @@ def unread(path: Path) -> str | None:
     return _UNREAD.get(path.suffix.lower())
 
 
-def refuse(path: Path, *, packed: str | None = None, primitives: str | None = None) -> None:
-    """Raise ``CheckpointError`` for a packed scene or a file of Gaussians, with the advice for it; None accepts it."""
-    if (kind := kind_of(path)) == "packed" and packed is not None:
-        raise CheckpointError(f"{path} is a packed scene; {packed}")
-    if kind in PRIMITIVES and primitives is not None:
-        raise CheckpointError(f"{path} is a {PRIMITIVES[kind]}; {primitives}")
-    if kind is None and (reason := unread(path)) is not None:
-        raise CheckpointError(f"{path} {reason}")
-
-
 def read_gaussian_file(path: Path) -> tuple[Sanitised, Marks]:
     """Read a file of Gaussians of any program, and what it states of them. Nothing in it is executed.
 
@@ -165,7 +155,8 @@ def read_gaussians(path: Path) -> tuple[dict[str, Tensor], bool]:
         logits = isinstance(model, dict) and model.get("sh_degree") == 0
         gaussians = Gaussians(params, "logits" if logits else "harmonics").as_harmonics()
         return dict(gaussians), (packed.meta.get("source") or {}).get("model_frame") is not False
-    refuse(path)
+    if (reason := unread(path)) is not None:
+        raise CheckpointError(f"{path} {reason}")
     if not path.is_dir():
         loaded = checkpoint.read(path)
     elif checkpoint.checkpoints(checkpoint.folder_of(path)):

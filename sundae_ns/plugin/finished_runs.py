@@ -36,7 +36,7 @@ from sundae_ns.data.layouts import posed_layout
 from sundae_ns.head.head import HeadConfig
 from sundae_ns.io import checkpoint
 from sundae_ns.io.config_file import check_run, config_of, load_config
-from sundae_ns.io.formats import kind_of, kind_of_gaussians, unread
+from sundae_ns.io.formats import kind_of, kind_of_gaussians
 from sundae_ns.io.run_folder import prunes_of
 from sundae_ns.plugin.datamanager import DATASET_FRAME, SundaeDatamanager, SundaeDatamanagerConfig
 from sundae_ns.plugin.dataparsers import camera_of, check_capture
@@ -44,7 +44,7 @@ from sundae_ns.plugin.model import SundaeModel, SundaeModelConfig
 from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.scene.cameras import spread
 from sundae_ns.scene.compose import transform
-from sundae_ns.scene.load_save import load, scene_of_checkpoint
+from sundae_ns.scene.load_save import load, no_scene, scene_of_checkpoint
 from sundae_ns.scene.packing import refusal
 from sundae_ns.scene.scene import Scene, measure, unit
 from sundae_ns.train.pruning import PruningConfig
@@ -104,11 +104,9 @@ def load_model(
     if scene is not None:
         opened = _open_file(path, scene, data or (None if like is None else like.capture))
     else:
-        wanted = "give the folder of a finished run, its config.yml, or a file of a scene"
         config = config_of(path)
         if config.name != "config.yml" or not config.is_file():
-            reason = "is no run" if path.exists() else "does not exist"
-            raise CheckpointError(f"{path} {unread(path) or f'{reason}; {wanted}'}")
+            raise no_scene(path)
         opened = _open_run(config, data, split)
     if split == "test":
         model = opened.model.eval()

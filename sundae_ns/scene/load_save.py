@@ -64,9 +64,7 @@ def load_with_mask(path: Path, device: torch.device | str = "cpu") -> tuple[Scen
             return load_with_mask(packed, device)
     if formats.kind_of_gaussians(path) is None:
         if (config := find_config(path)) is None:
-            reason = "is no run" if path.exists() else "does not exist"
-            wanted = "give a run, its config.yml, or a .sundae, .ply, .spz, .sog, .glb, .splat, .ksplat or .pt file"
-            raise CheckpointError(f"{path} {formats.unread(path) or f'{reason}; {wanted}'}")
+            raise no_scene(path)
         source = (path, checkpoint.read(path)) if path.suffix == ".ckpt" else checkpoint.read_newest(config.parent)
         return scene_of_checkpoint(*source, config).to(device), None
     sanitised, marks = formats.read_gaussian_file(path)
@@ -75,6 +73,13 @@ def load_with_mask(path: Path, device: torch.device | str = "cpu") -> tuple[Scen
     if rows := [[*(float(i == j) for j in range(3)), -value] for i, value in enumerate(marks.offset or ())]:
         facts["meta"] = {"frame": {"transform": rows, "scale": 1.0}}
     return Scene(sanitised.gaussians, **facts).to(device), sanitised.mask
+
+
+def no_scene(path: Path) -> CheckpointError:
+    """The error for a path without a scene that any reader takes, and for one that is missing."""
+    reason = "is no run" if path.exists() else "does not exist"
+    wanted = "give a run, its config.yml, or a .sundae, .ply, .spz, .sog, .glb, .splat, .ksplat or .pt file"
+    return CheckpointError(f"{path} {formats.unread(path) or f'{reason}; {wanted}'}")
 
 
 def save(scene: Scene, path: Path | str, *, upright: bool = False, config: PackConfig | None = None) -> None:
@@ -100,7 +105,8 @@ def save(scene: Scene, path: Path | str, *, upright: bool = False, config: PackC
     >>> sn.load(path).num_gaussians
     50
     """
-    path, suffix = Path(path), Path(path).suffix.lower()
+    path = Path(path)
+    suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise ConfigError(f"{path} has no supported suffix; name it {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
     if upright and suffix not in formats.FORMATS:
@@ -122,8 +128,7 @@ def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -
     """The scene of a checkpoint with the contents ``loaded``, on the CPU; ``CheckpointError`` if they do not fit."""
     options = model_options(config)
     gaussians, state = checkpoint.gaussians_of(loaded, source), checkpoint.model_state(loaded)
-    entries = state.get(checkpoint.EXTRA_STATE)
-    extra = entries if isinstance(entries, Mapping) else {}
+    extra = entries if isinstance(entries := state.get(checkpoint.EXTRA_STATE), Mapping) else {}
     focal = extra.get("trained_focal")
     head = _head_of(state, options, source) if extra.get("head_enabled") else None
     if head is not None:

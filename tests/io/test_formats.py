@@ -18,7 +18,8 @@ import sundae_ns as sn
 from sundae_ns.core.errors import CheckpointError, DataError
 from sundae_ns.core.gaussians import SPLAT_NAMES, Gaussians, bytes_of, sh_degree
 from sundae_ns.head.head import bytes_of_module
-from sundae_ns.io.formats import kind_of, read_gaussian_file, read_gaussians, refuse, write_for_viewers, write_levels
+from sundae_ns.io.config_file import check_run
+from sundae_ns.io.formats import kind_of, read_gaussian_file, read_gaussians, write_for_viewers, write_levels
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, write_fitted
 from sundae_ns.io.ply import Marks, keep_vertices, read_ply, read_point_cloud, write_ply
 from sundae_ns.io.spz import fractional_bits
@@ -220,12 +221,10 @@ def test_kinds_follow_from_first_bytes(tmp_path):
     kinds = {"packed.ply": "packed", "points.sundae": "ply", "dos.txt": "ply"}
     kinds |= dict.fromkeys(("word.ply", "empty.sundae", "missing.sundae", "."))
     assert {name: kind_of(tmp_path / name) for name in kinds} == kinds
-    with pytest.raises(CheckpointError, match=r"packed\.ply is a packed scene; unpack it$"):
-        refuse(tmp_path / "packed.ply", packed="unpack it")
-    with pytest.raises(CheckpointError, match=r"points\.sundae is a \.ply file; give a run$"):
-        refuse(tmp_path / "points.sundae", packed="unpack it", primitives="give a run")
-    refuse(tmp_path / "points.sundae", packed="unpack it")
-    refuse(tmp_path / "word.ply", packed="unpack it", primitives="give a run")
+    with pytest.raises(CheckpointError, match=r"packed\.ply is a packed scene; give the run that was packed$"):
+        check_run(tmp_path / "packed.ply")
+    with pytest.raises(CheckpointError, match=r"points\.sundae is a \.ply file; give the folder of a run; "):
+        check_run(tmp_path / "points.sundae")
 
 
 def test_bytes_of_fields_and_modules():
