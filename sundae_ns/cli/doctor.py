@@ -95,12 +95,14 @@ def parts(compile_kernels: bool = False) -> list[Part]:
 
 def _checked(name: str, check: Callable[[], str | None], remedy: str, purpose: str) -> Part:
     """The part of a check, which returns nothing or raises an error if the part is missing."""
-    found, problem = None, "not found"
+    version, problem = None, "not found"
     try:
-        found = check()
-    except (SundaeError, metadata.PackageNotFoundError) as error:
-        problem = str(error) if isinstance(error, SundaeError) else "not installed"
-    return Part(name, bool(found), (found or problem) + (f", for {purpose}" if purpose else ""), remedy)
+        version = check()
+    except SundaeError as error:
+        problem = str(error)
+    except metadata.PackageNotFoundError:
+        problem = "not installed"
+    return Part(name, bool(version), (version or problem) + (f", for {purpose}" if purpose else ""), remedy)
 
 
 def _cuda() -> str:

@@ -20,7 +20,6 @@ from sundae_ns.io.pack.config import FINETUNE_STEPS, FINETUNED_SIZE
 from sundae_ns.io.run_folder import new_name, unfinished_run
 
 PACKED = "scene.sundae"
-METHODS = sorted(entry_points(group="nerfstudio.method_configs", module="sundae_ns.method_configs").names)
 LENGTHS = ("--max-num-iterations", "--schedule-length", "--finetune-steps")  # options of ns-train
 
 
@@ -36,8 +35,9 @@ class TrainOptions(Wishes):
         """Raise ``DataError`` if the capture does not exist, and ``ConfigError`` for a wrong option."""
         if not capture.exists():
             raise DataError(f"{capture} does not exist; check the path")
-        if self.method not in METHODS:
-            raise ConfigError(f"{self.method} is no method of sundae; use one of {', '.join(METHODS)}")
+        methods = entry_points(group="nerfstudio.method_configs", module="sundae_ns.method_configs").names
+        if self.method not in methods:
+            raise ConfigError(f"{self.method} is no method of sundae; use one of {', '.join(sorted(methods))}")
         self.check_wishes()
         if self.count is not None and self.cleans:
             raise ConfigError(f"a training reaches --count before {self.cleans[0]} cuts; give both to sundae pack")

@@ -4,6 +4,7 @@ import fcntl
 import json
 import re
 import shlex
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import command_line
@@ -12,15 +13,16 @@ from colmap_models import write_model
 from PIL import Image
 from run_commands import config_of, write_run
 
-from sundae_ns.cli.train import METHODS
 from sundae_ns.io.run_folder import LOCK, unfinished_run
+
+OURS = "sundae_ns.method_configs"
 
 
 def train(*words):
     return command_line.run("train", *words)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", sorted(entry_points(group="nerfstudio.method_configs", module=OURS).names))
 def test_the_printed_command_runs(commands, capsys, method):
     assert train("scene", "-o", "my runs", "--method", method, "--steps", "700", "--keep", "0.05") == 0
     assert shlex.split(capsys.readouterr().out.splitlines()[0]) == commands.ran[0]
