@@ -79,19 +79,17 @@ class Edit(NamedTuple):
 
     def cleaned(self) -> Edit:
         """Without a head, what is outside the box, and floaters, if they should go."""
-        edit, wishes = self, self.wishes
-        if self.details.no_head:
-            edit = edit._replace(scene=replace(self.scene, head=None))
-        if not wishes.cleans:
+        edit = self._replace(scene=replace(self.scene, head=None)) if self.details.no_head else self
+        if not self.wishes.cleans:
             return edit
         with naming_full_memory(lambda: len(self.rows)):
             edit = edit._replace(scene=edit.scene.to(fastest_device()))
-            if wishes.crop is not None:
-                mask = crop_mask(edit.scene, wishes.crop[:3], wishes.crop[3:])
+            if (crop := self.wishes.crop) is not None:
+                mask = crop_mask(edit.scene, crop[:3], crop[3:])
                 print(f"{int(mask.sum()):,} of {len(mask):,} Gaussians are in the box", file=sys.stderr)
                 edit = edit.cut(mask)
-            if wishes.remove_floaters is not None:
-                mask = ~floater_mask(edit.scene, edit.cameras, wishes.remove_floaters, Console(stderr=True))
+            if self.wishes.remove_floaters is not None:
+                mask = ~floater_mask(edit.scene, edit.cameras, self.wishes.remove_floaters, Console(stderr=True))
                 why = "" if edit.cameras else ", by their neighbours alone: no camera of the photographs is known"
                 print(f"removed {int((~mask).sum()):,} floaters of {len(mask):,} Gaussians{why}", file=sys.stderr)
                 if not bool(mask.any()):
@@ -115,11 +113,11 @@ class Edit(NamedTuple):
 
         ``rounds`` says whether a size also decides how it is rounded; ``write`` makes what has the size, if not a file.
         """
-        edit, wishes, count = self.cleaned(), self.wishes, self.wishes.count
+        edit, wishes = self.cleaned(), self.wishes
         if not wishes.reduces and target_drop is None:
             return edit
         with naming_full_memory(lambda: len(self.rows)):
-            scene, cameras = edit.scene.to(fastest_device()), edit.cameras
+            scene, cameras, count = edit.scene.to(fastest_device()), edit.cameras, wishes.count
             scene = opening(scene) if out.suffix.lower() in (".html", "") else scene  # once, not for each file
             rule = replace(rule or PruneRule(), seed=self.details.seed or 0)
             if rule.uses_contribution or wishes.max_mb is not None or target_drop is not None:
@@ -139,10 +137,10 @@ class Edit(NamedTuple):
             warnings: dict[bytes, str] = {}  # by the file whose writing they are of
 
             def file_of(pruned: PrunedScene, form: Form) -> bytes:
-                with redirect_stderr(StringIO()) as said:
+                with redirect_stderr(StringIO()) as messages:
                     (write or Edit.write)(after(pruned, form), Path(folder, out.name))
                 file = b"".join(part.read_bytes() for part in Path(folder).rglob("*") if part.is_file())
-                warnings[file] = said.getvalue().replace(folder, str(out.parent))
+                warnings[file] = messages.getvalue().replace(folder, str(out.parent))
                 return file
 
             with TemporaryDirectory() as folder:
@@ -152,16 +150,16 @@ class Edit(NamedTuple):
 
     def for_page(self, out: Path = Path("page.html"), write: Callable[[Path, Shown], object] = write_page) -> Shown:
         """Name, scene and packed file of what a page shows, which ``write`` makes; a packed scene stays as it is."""
-        details, source = self.details, self.source.resolve()
+        source = self.source.resolve()
         name = (source.parent if source.name == "scene.sundae" else source).stem  # sundae run names all packs so
         if is_run(self.source):  # its file is CAPTURE/METHOD/TIME/config.yml
             name = config_of(self.source).resolve().parents[2].name
         left = self.reduced(out, write=lambda edit, path: write(path, shown_as(name, edit.stated, edit.form.precision)))
         same = kind_of(self.source) == "packed" and not (self.wishes.cleans or self.wishes.reduces)
-        if not same or details.no_head or details.cameras is not None:
+        if not same or self.details.no_head or self.details.cameras is not None:
             return shown_as(name, left.stated, left.form.precision)
         packed = self.source.read_bytes()
-        if details.start_view is not None or details.up is not None:
+        if self.details.start_view is not None or self.details.up is not None:
             from sundae_ns.scene.packing import stated_start  # its encoder needs a compiler, which other files do not
 
             packed = container.restated(packed, stated_start(left.scene))

@@ -129,5 +129,5 @@ def progress_bar() -> Progress:
     """A bar on the terminal of stderr, which is gone at its end."""
     console = Console(file=sys.stderr)  # a command may redirect it afterwards
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    is_terminal, both = console.is_terminal, sys.stdout.isatty()  # stdout may be a file
-    return Progress(*columns, console=console, transient=True, disable=not is_terminal, redirect_stdout=both)
+    tty = sys.stdout.isatty()  # it may be a file
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal, redirect_stdout=tty)

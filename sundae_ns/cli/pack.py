@@ -71,7 +71,6 @@ def pack(
     source = contents_of(left.stated)
     packs: list[tuple[PackedScene, Codecs]] = []
     most = None if max_mb is None else int(max_mb * MEGABYTE)
-    figures: dict[str, Any] = {}
     with progress_bar() as bar, redirect_stdout(StringIO()):  # nerfstudio's messages
         task = bar.add_task("Fine-tuning" if steps else "Packing", total=2 + steps * (1 if most is None else 2))
         if kind is None:
@@ -93,8 +92,8 @@ def pack(
             packs.append(fit_scene(source, left.form.precision))
         report = write_fitted(out, *packs[0])
         bar.update(task, advance=1, description="Measuring")
-        if kind is None and wishes.crop is None:  # photos show what a box leaves out
-            figures = _measured(judge, packs, steps)
+        # Photos show what a box leaves out.
+        figures = _measured(judge, packs, steps) if kind is None and wishes.crop is None else {}
     if advanced.json:
         print(dumps(without_nan({"file": str(out), **report.summary(), **figures})))
         return 0
@@ -117,15 +116,15 @@ def _measured(judge: Callable[[], Judge], packs: Sequence[tuple[PackedScene, Cod
 
     try:
         views = judge()
-        before, (after, *others) = views.before, [views.quality(*pack) for pack in packs]
+        after, *others = (views.quality(*pack) for pack in packs)
     except SundaeError as error:
         print(f"the quality is not measured: {error}", file=sys.stderr)
         return {}
     size, *sizes = (len(pack_bytes(*pack)[0]) for pack in packs)
     for other, plain in zip(others, sizes, strict=True):
         if not is_worth(after.psnr, size, other.psnr, plain):
-            lost = f"the fine-tune of {steps:,} steps loses {before.psnr - after.psnr:.2f} dB"
-            other_lost = f"a pack without it has {plain:,} bytes and loses {before.psnr - other.psnr:.2f} dB"
+            lost = f"the fine-tune of {steps:,} steps loses {views.before.psnr - after.psnr:.2f} dB"
+            other_lost = f"a pack without it has {plain:,} bytes and loses {views.before.psnr - other.psnr:.2f} dB"
             print(f"{lost}; {other_lost}: give more steps, or leave out --finetune", file=sys.stderr)
-    figures = {"psnr": [before.psnr, after.psnr], "ssim": [before.ssim, after.ssim]}
+    figures = {"psnr": [views.before.psnr, after.psnr], "ssim": [views.before.ssim, after.ssim]}
     return {**figures, "views": views.cameras, "test_views": views.all_cameras}

@@ -37,8 +37,8 @@ def run_command(words: Sequence[str], log: Path | None = None) -> int:
         task = bar.add_task("Training", total=100)
 
         def show(line: str) -> None:
-            percent, line = percent_of(line), line.rstrip()
-            if percent is not None:
+            line = line.rstrip()
+            if (percent := percent_of(line)) is not None:
                 bar.update(task, completed=percent, description=" ".join(["Training", *line.split("  ")[-2:]]))
             if _MESSAGES.match(line) or (percent is not None and bar.disable):
                 print(line, flush=True)

@@ -57,13 +57,13 @@ def render(
     if video and speed is None:
         with Console(stderr=True).status("Finding a path"):
             views = film_views(left, seconds=12.0 if seconds is None else seconds, frames_per_second=fps or 24)
-    shown = views or list(filter(None, [opening(left).start]))
-    views = [each if width is None else each.zoomed(width / each.width) for each in shown]
+    views = views or list(filter(None, [opening(left).start]))
+    views = [camera if width is None else camera.zoomed(width / camera.width) for camera in views]
     if video:  # whose colours have half the size
-        views = [each._replace(width=each.width // 2 * 2, height=each.height // 2 * 2) for each in views]
+        views = [camera._replace(width=camera.width // 2 * 2, height=camera.height // 2 * 2) for camera in views]
         speed = fps or speed or 24
         with replacing(out) as partial, progress_bar() as bar:
-            images = (image_of(render_view(left, each).rgb) for each in bar.track(views, description="Rendering"))
+            images = (image_of(render_view(left, camera).rgb) for camera in bar.track(views, description="Rendering"))
             count = write_video(partial, images, frames_per_second=speed)
         print(f"{out}: {count} frames of {views[0].width} x {views[0].height} px, {count / speed:.1f} s")
         return 0

@@ -77,11 +77,11 @@ class Project:
 
     def check(self) -> None:
         """Raise an error for photos that cannot be used, and for options that contradict each other."""
-        draft, method = self.quality == "draft", self.train.method
+        method = self.train.method
         if not self.posed and ((self.photos / "sparse").is_dir() or is_model(self.photos)):
             raise no_transforms(self.photos)  # says how to use a capture in another layout
         self.train.check(self.photos)
-        if draft and (self.train.steps is not None or method == "sundae-tiny"):
+        if self.quality == "draft" and (self.train.steps is not None or method == "sundae-tiny"):
             raise ConfigError(f"a draft has {DRAFT_STEPS:,} steps, and sundae-tiny fewer; leave out --quality")
         if self.quality == "best" and (self.train.keep, self.train.count, method) != (None, None, "sundae"):
             raise ConfigError("--quality best needs a method that decides; leave out --keep, --count and --method")
@@ -179,7 +179,7 @@ def run(project: Plain[Project]) -> int:
 
 def carry_out(project: Project) -> int:
     """Take the steps of a project that are not done; the exit code."""
-    out, plan = project.out, project.plan()
+    plan = project.plan()
     for number, step in enumerate(plan, start=1):
         heading = f"# step {number} of {len(plan)}, {step.name}"
         if _passes(step.check):
@@ -190,18 +190,18 @@ def carry_out(project: Project) -> int:
                 later.result.unlink(missing_ok=True)
         print(f"{heading}:", flush=True)
         if code := step.run():
-            said = f"{step.name} ended with {code}, as the lines above say; mend that, and the same command continues"
+            end = f"{step.name} ended with {code}, as the lines above say; mend that, and the same command continues"
             if code in STOPPED:
-                said = "interrupted; the same command continues here"
+                end = "interrupted; the same command continues here"
             elif code > 128:  # by a signal, as where memory is full
-                said = f"{step.name} was killed by signal {code - 128}; the same command tries it again"
-            print(f"sundae: {said}", file=sys.stderr)
+                end = f"{step.name} was killed by signal {code - 128}; the same command tries it again"
+            print(f"sundae: {end}", file=sys.stderr)
             return code
         if not _passes(step.check):
             raise SundaeError(f"{step.name} ended without its result; the output above says why")
-    print(f"# packed scene: {out / 'scene.sundae'}; report: {out / 'report' / 'report.html'}")
-    print(f"# to look at the scene: open {out / 'scene.html'} in a browser, or")
-    print(shlex.join(["sundae", "view", word(out / "scene.sundae")]))
+    print(f"# packed scene: {project.out / 'scene.sundae'}; report: {project.out / 'report' / 'report.html'}")
+    print(f"# to look at the scene: open {project.out / 'scene.html'} in a browser, or")
+    print(shlex.join(["sundae", "view", word(project.out / "scene.sundae")]))
     return 0
 
 

@@ -72,8 +72,8 @@ class Smoother:
         n, k = graph.indices.shape
         self._factors = linalg.splu
         self._diagonal = lambda values: dia_array((values[None], [0]), shape=(n, n))
-        values, columns = graph.weights.detach().double().cpu().numpy().ravel(), graph.indices.cpu().numpy().ravel()
-        directed = csr_array((values, (np.repeat(np.arange(n), k), columns)), shape=(n, n))
+        entries = (np.repeat(np.arange(n), k), graph.indices.cpu().numpy().ravel())
+        directed = csr_array((graph.weights.detach().double().cpu().numpy().ravel(), entries), shape=(n, n))
         weights = 0.5 * (directed + directed.T)
         degrees = np.asarray(weights.sum(axis=1)).ravel()
         scale = strength / degrees.mean() if degrees.any() else 0.0

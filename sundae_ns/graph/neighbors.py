@@ -83,7 +83,8 @@ def _search_host(
     # Fitting boxes to their points takes a quarter of the time to build, and saves nothing in a balanced tree.
     tree = cKDTree(coordinates[order[starts]], compact_nodes=False)
     indices, distances = np.empty((n, k), np.int64), np.empty((n, k), dtype)
-    slots, nearest = np.arange(k + 1), np.arange(1, min(k + 1, len(starts)) + 1)
+    slots = np.arange(k + 1)
+    nearest = np.arange(1, min(k + 1, len(starts)) + 1)
     for rows in np.array_split(order, -(-n // CHUNK)):
         lengths, positions = tree.query(coordinates[rows], k=nearest, workers=-1)
         points = order[starts[positions]]
@@ -212,8 +213,7 @@ def _segments(rows: Tensor, level: int) -> Tensor:
     """Split ``[C, N]`` into the segments of a level, ``[C, 2^level, most]``; shorter ones repeat their last value."""
     n, count = rows.shape[1], 2**level
     starts = torch.arange(count + 1, device=rows.device) * n // count
-    most = -(-n // count)
-    positions = starts[:-1, None] + torch.arange(most, device=rows.device)
+    positions = starts[:-1, None] + torch.arange(-(-n // count), device=rows.device)
     return rows[:, torch.minimum(positions, starts[1:, None] - 1)]
 
 

@@ -47,8 +47,7 @@ def correction(net: UNet, residual: bool, splatted: Tensor, alpha: Tensor, dtype
     It has gradients for splatted values, accumulation and the network's parameters. Arguments and errors are those of
     :func:`compensated`.
     """
-    layers = (*convolutions(net), net.out)
-    parameters = [value for layer in layers for value in (layer.weight, layer.bias)]
+    parameters = [value for layer in (*convolutions(net), net.out) for value in (layer.weight, layer.bias)]
     return cast("Tensor", _Correction.apply(splatted, alpha, net, residual, dtype, *parameters))
 
 
@@ -142,7 +141,8 @@ def fold_pixels(
 def network(net: UNet, weights: list[Tensor], folded: Tensor, launches: Launches) -> Tape:
     """Run the network from its folded input ``[1, C, h, w]``, channels last, to the input of the last kernel."""
     levels = len(net.encoder)
-    inputs, coarse = [], []
+    inputs: list[Tensor] = []
+    coarse: list[Tensor] = []
     convs = iter(zip(weights, convolutions(net), strict=True))
 
     def convolved(x: Tensor) -> tuple[Tensor, Tensor]:
@@ -156,8 +156,8 @@ def network(net: UNet, weights: list[Tensor], folded: Tensor, launches: Launches
         launches["activate"](raw.numel() // PACK, [raw, bias, channels, rows * columns])
         return convolved(raw)
 
-    x, skips = folded, []
-    raw, bias = double(x)
+    skips = []
+    raw, bias = double(folded)
     for level in range(1, levels):
         _, channels, rows, columns = raw.shape
         # The skip connection needs no copy: it is written where the decoder reads it.
@@ -170,8 +170,7 @@ def network(net: UNet, weights: list[Tensor], folded: Tensor, launches: Launches
     for skip in reversed(skips):
         _, channels, rows, columns = raw.shape
         coarse.append(raw)
-        threads = 4 * raw.numel() // PACK
-        launches["upsample"](threads, [raw, bias, channels, rows, columns, skip, skip.shape[1]])
+        launches["upsample"](4 * raw.numel() // PACK, [raw, bias, channels, rows, columns, skip, skip.shape[1]])
         raw, bias = double(skip)
     return Tape(inputs, coarse, raw)
 
@@ -290,7 +289,8 @@ def unfold_backward(
     height, width = gradient.shape[:2]
     rows, columns = raw.shape[-2:]
     outputs = len(net.out.weight)
-    gradient, grad_raw = gradient.contiguous(), torch.empty_like(raw)
+    gradient = gradient.contiguous()
+    grad_raw = torch.empty_like(raw)
     values, grad_values = raw.new_empty(rows, columns, raw.shape[1]), raw.new_empty(rows, columns, outputs)
     grad_alpha = torch.zeros_like(alpha, memory_format=torch.contiguous_format)
     layers: list[Argument] = [raw, *last_layers(net), rows, columns]

@@ -20,7 +20,7 @@ from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.data.capture import finite, matrix, read_json, rigid, side
 from sundae_ns.data.colmap import read_images
 from sundae_ns.data.layouts import is_model, models_in
-from sundae_ns.data.lenses import kind_of_frame, with_focal_lengths
+from sundae_ns.data.lenses import INTRINSICS, kind_of_frame, with_focal_lengths
 from sundae_ns.scene.scene import Scene, unit
 from sundae_ns.scene.virtual_cameras import FOV, front_views
 
@@ -70,7 +70,8 @@ def read_cameras(path: Path, scene: Scene | None = None) -> tuple[list[Camera], 
     if len(entries) > MOST_CAMERAS:
         raise DataError(f"{path.name} has {len(entries):,} cameras; give at most {MOST_CAMERAS:,}")
     read = _of_path if "camera_path" in content else _of_frame if content else _of_colmap
-    (transform, scale), cameras = _to_model(scene, content, path.name), list[Camera]()
+    transform, scale = _to_model(scene, content, path.name)
+    cameras: list[Camera] = []
     for i, entry in enumerate(entries):
         pose, intrinsics, width, height = read(entry, content, f"{path.name}, frame {i}")
         moved = transform[:3, :3] @ pose[:3]
@@ -84,8 +85,7 @@ def _of_frame(entry: Any, content: dict[str, Any], where: str) -> Pinhole:
     stated = {**content, **entry} if isinstance(entry, dict) else {}
     kind_of_frame(stated, where)
     pose = rigid(matrix(stated.get("transform_matrix"), (3, 4), "transform_matrix", where), where)
-    names = ("fl_x", "fl_y", "cx", "cy")
-    intrinsics = [finite(stated.get(name), name, where, positive=name.startswith("fl")) for name in names]
+    intrinsics = [finite(stated.get(name), name, where, positive=name.startswith("fl")) for name in INTRINSICS[:4]]
     return pose, intrinsics, side(stated.get("w"), "w", where), side(stated.get("h"), "h", where)
 
 

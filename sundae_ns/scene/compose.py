@@ -122,10 +122,9 @@ def merge(scenes: Iterable[Scene]) -> Scene:
     names = [name for name in first.gaussians if name != FEATURES or first.head is not None]
     rest = [pad(part["features_rest"], (0, 0, 0, most - part["features_rest"].shape[1])) for part in parts]
     parts = [part.replaced({"features_rest": value}) for part, value in zip(parts, rest, strict=True)]
-    params = {name: torch.cat([part[name] for part in parts]) for name in names}
     return dataclasses.replace(
         first,
-        gaussians=Gaussians(params, parts[0].encoding),
+        gaussians=Gaussians({name: torch.cat([part[name] for part in parts]) for name in names}, parts[0].encoding),
         cameras=tuple(dict.fromkeys(camera for scene in scenes for camera in scene.cameras)),  # parts share theirs
         up=first.up or next((scene.up for scene in scenes if scene.up), None),
     )
@@ -143,7 +142,7 @@ def _same(head: CompensationHead | None, other: CompensationHead | None) -> bool
     if head is None or other is None or head is other:
         return head is other
     pairs = zip(head.state_dict().values(), other.state_dict().values())
-    return head.config == other.config and all(torch.equal(value.cpu(), same.cpu()) for value, same in pairs)
+    return head.config == other.config and all(torch.equal(value.cpu(), its.cpu()) for value, its in pairs)
 
 
 def crop(scene: Scene, low: AnyArray, high: AnyArray) -> Scene:

@@ -55,8 +55,8 @@ def bytes_at(path: Path) -> int | None:
     kind = kind_of_gaussians(path)
     if kind is None and kind_of(path) is None and find_config(path) is not None:
         return None
-    inside = (path.parent if path.name in METAS else path).rglob("*")
-    files = rank_files(path) if kind == "gsplat" else {path, *inside}
+    folder = path.parent if path.name in METAS else path
+    files = rank_files(path) if kind == "gsplat" else {path, *folder.rglob("*")}
     return sum(file.stat().st_size for file in files if file.is_file())
 
 
@@ -69,15 +69,15 @@ def describe(
     ``invisible`` is the share of the Gaussians that no camera sees, ``floaters`` how many a cleaning would remove, and
     ``crop`` a box, lowest corner first, of 99% of what they see. Cameras are by default the stored, else virtual ones.
     """
-    gaussians, cameras = scene.gaussians, cameras or scene.cameras
+    cameras = cameras or scene.cameras
     views = for_cleaning(cameras) or virtual_cameras(scene, LOOKING)
-    weights, means = weights_in(scene, views, console=console), gaussians["means"].double()
+    weights, means = weights_in(scene, views, console=console), scene.means.double()
     end = 1 << 16 if path.is_file() and kind_of(path) != "sog" else None  # a .sog holds its meta.json anywhere
     stated = _PRODUCER.search(path.read_bytes()[:end] if path.is_file() else b"")
     return {
         "bytes": bytes_at(path) or bytes_of(scene.gaussians) + bytes_of_module(scene.head),
         "gaussians": scene.num_gaussians,
-        "sh_degree": gaussians.sh_degree,
+        "sh_degree": scene.gaussians.sh_degree,
         "head": None if scene.head is None else scene.head.config.size,
         "low": means.amin(dim=0).tolist(),
         "high": means.amax(dim=0).tolist(),

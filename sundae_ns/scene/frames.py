@@ -27,8 +27,7 @@ from sundae_ns.scene.render import GaussianSource, RenderSettings, render_view, 
 
 _log = logging.getLogger(__name__)
 
-OUTPUTS = ("rgb", "base_rgb", "depth", "accumulation", "features", "response")
-"""Outputs beside the background, in the order in which viewers list them."""
+OUTPUTS = ("rgb", "base_rgb", "depth", "accumulation", "features", "response")  # in the order of viewers' lists
 GaussiansKey = tuple[int, int]  # a state of the Gaussians: their number, and the number of prunes
 SPARE_CAPACITY = 1.5  # for tile and Gaussian pairs, as a multiple of the recorded view's: another view may have more
 REPLAYED = ("rgb", "base_rgb", "accumulation")  # images of a recorded frame
@@ -241,5 +240,4 @@ def _replay(frame: _Frame, camera: Camera, background: Tensor) -> tuple[dict[str
     """Images, and the number of pairs; the images are wrong if these exceed the capacity."""
     torch._foreach_copy_(list(frame.inputs), [camera.viewmat, camera.K, background.to(camera.viewmat)])
     frame.graph.replay()
-    images = {name: image.clone() for name, image in frame.images.items()}
-    return images, int(frame.needed)
+    return {name: image.clone() for name, image in frame.images.items()}, int(frame.needed)

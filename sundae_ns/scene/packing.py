@@ -62,8 +62,8 @@ def contents_of(scene: Scene) -> PackedScene:
     scene = replace(scene, gaussians=sanitise(scene.gaussians).gaussians).to("cpu")
     head = {} if scene.head is None else dict(scene.head.state_dict())
     gaussians = {name: value.detach() for name, value in scene.gaussians.items() if name != FEATURES or head}
-    stated = _MODEL["properties"]["head"]["required"]
-    options = None if scene.head is None else {name: getattr(scene.head.config, name) for name in stated}
+    required = _MODEL["properties"]["head"]["required"]
+    options = None if scene.head is None else {name: getattr(scene.head.config, name) for name in required}
     degree = 0 if scene.gaussians.encoding == "logits" else max(scene.gaussians.sh_degree, 1)  # 0 stands for logits
     model = {
         "sh_degree": degree,

@@ -101,13 +101,13 @@ def page_of(*scenes: Shown, views: Mapping[str, View] | None = None, files: Sequ
     if not 1 <= len(scenes) <= 2:
         raise ConfigError(f"a page of {len(scenes)} scenes was asked for; give one or two")
     links = json.dumps([(name, link_of(view, scenes[0][1], name)) for name, view in (views or {}).items()])
-    places = [
+    elements = [
         f'<script type="application/octet-stream" class="scene" data-name="{html.escape(name)}"'
         f' data-source="{file}">{"" if file else base64.b64encode(packed).decode()}</script>'
         for (name, _, packed), file in zip(scenes, files or [""] * len(scenes), strict=True)
     ]
     values = {"TITLE": html.escape(" | ".join(name for name, *_ in scenes)), "POSTER": _poster(scenes[0][1])}
-    values |= {"VIEWS": links.replace("<", "\\u003c"), "SCENES": "\n".join(places)}
+    values |= {"VIEWS": links.replace("<", "\\u003c"), "SCENES": "\n".join(elements)}
     template = resources.files("sundae_ns.scene").joinpath("page.html").read_text(encoding="utf-8")
     # In one pass: a title may contain the name of another value.
     return re.sub("@@([A-Z]+)@@", lambda name: values[name[1]], template)

@@ -206,8 +206,7 @@ def refit(
             with torch.enable_grad():
                 loss = error(fitted(), [trained[k % len(trained)] for k in range(i * views, (i + 1) * views)])
             # Not by torch.optim, which imports a compiler for two seconds.
-            gradients = torch.autograd.grad(loss, list(moved.values()))
-            rows = zip(moved.values(), gradients, running, strict=True)
+            rows = zip(moved.values(), torch.autograd.grad(loss, list(moved.values())), running, strict=True)
             updates = [Update(value, gradient.contiguous(), *state) for value, gradient, state in rows]
             adam_step([(adam, updates)], size.new_full((1,), factor * (1 - i / steps)), None)
     gaussians = fitted()
@@ -293,7 +292,9 @@ def prune_to_bytes(
     The scene is finite; ``write`` makes the content. Every eighth of the ``cameras`` compares the forms. Bars and
     remarks go to stderr. ``ConfigError`` if hardly a Gaussian fits.
     """
-    n, file_of, packs = scene.num_gaussians, cache(write), len({form.power for form in forms}) > 1
+    n = scene.num_gaussians
+    file_of = cache(write)
+    packs = len({form.power for form in forms}) > 1
 
     def bytes_of(pruned: PrunedScene, form: Form) -> int:
         return len(file_of(pruned, form))
@@ -303,11 +304,11 @@ def prune_to_bytes(
             form = largest(lambda power: form._replace(power=power), partial(bytes_of, pruned), most, form.power)
         return pruned, form, file_of(pruned, form)
 
-    whole_scene = PrunedScene(scene, torch.ones(n, dtype=torch.bool, device=scene.device))
+    unpruned = PrunedScene(scene, torch.ones(n, dtype=torch.bool, device=scene.device))
     lines = [_bytes_by_count(scene, partial(bytes_of, form=form)) for form in forms]
     # Sparser Gaussians take more bytes each, so the whole scene takes at most about this.
-    if lines[0][0] + n * lines[0][1] <= most and bytes_of(whole_scene, forms[0]) <= most:
-        left = rounded(whole_scene, forms[0])
+    if lines[0][0] + n * lines[0][1] <= most and bytes_of(unpruned, forms[0]) <= most:
+        left = rounded(unpruned, forms[0])
         if len(left[2]) < LEAST * most:
             print(f"the whole scene takes {len(left[2]) / MEGABYTE:.2f} MB, less than was asked for", file=sys.stderr)
         return left
@@ -326,8 +327,8 @@ def prune_to_bytes(
     if packs and counts[0] > 0:  # more fit where they are much denser than those that were counted
         size = bytes_of(cut(counts[0]), forms[0])
         counts = [min(n, int(count * AIM * most / size)) for count in counts]
-        if 2 * counts[0] > n and bytes_of(whole_scene, forms[0]) <= most:
-            return rounded(whole_scene, forms[0])
+        if 2 * counts[0] > n and bytes_of(unpruned, forms[0]) <= most:
+            return rounded(unpruned, forms[0])
     candidates = ((form, cut(count)) for form, count in zip(forms, counts, strict=True) if count > 0)
     form, pruned = next(candidates) if len(forms) == 1 else _nearest_form(scene, candidates, cameras, packs)
 
@@ -338,9 +339,9 @@ def prune_to_bytes(
 
     def sized(change: Callable[[PrunedScene], PrunedScene], near: PrunedScene) -> PrunedScene:
         """What has as many Gaussians as fit, changed before it is written; the search begins ``near`` it."""
-        halvings, powers = math.log2(n / len(near.scene)), (0.0, math.log2(n))
-        at, size = lambda power: change(cut(max(round(n / 2**power), 1))), partial(bytes_of, form=form)
-        return largest(at, size, most, halvings, powers, 1.0)
+        halvings, size = math.log2(n / len(near.scene)), partial(bytes_of, form=form)
+        powers = (0.0, math.log2(n))
+        return largest(lambda power: change(cut(max(round(n / 2**power), 1))), size, most, halvings, powers, 1.0)
 
     # A fit hardly changes the bytes, so its search begins with a count that fits without.
     return rounded(fit(pruned) if packs else sized(fit, sized(lambda pruned: pruned, pruned)), form)
@@ -348,8 +349,8 @@ def prune_to_bytes(
 
 def _bytes_by_count(scene: Scene, bytes_of: Callable[[PrunedScene], int]) -> tuple[float, float]:
     """Bytes of a file of no Gaussian, and of each one, by two files of random ones."""
-    places = torch.randperm(scene.num_gaussians, generator=torch.Generator().manual_seed(0)).argsort().to(scene.device)
-    few, many = (places < count for count in SAMPLED)
+    ranks = torch.randperm(scene.num_gaussians, generator=torch.Generator().manual_seed(0)).argsort().to(scene.device)
+    few, many = (ranks < count for count in SAMPLED)
     first, second = (bytes_of(PrunedScene(scene[mask], mask)) for mask in (few, many))
     each = (second - first) / max(int(many.sum() - few.sum()), 1) or first / len(scene)
     return first - int(few.sum()) * each, each

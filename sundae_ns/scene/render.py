@@ -101,9 +101,8 @@ def draw(
     primitives: Mapping[str, Tensor], camera: Camera, background: Tensor, settings: RenderSettings, *, depth: bool
 ) -> tuple[dict[str, Any], Rasterization]:
     """Splat colours, features if the head is enabled, and depth in one pass: the images of :func:`render_view`."""
-    channels = primitives["colors"]
-    if settings.head is not None:
-        channels = torch.cat([channels, primitives[FEATURES]], dim=1)
+    colors = primitives["colors"]
+    channels = colors if settings.head is None else torch.cat([colors, primitives[FEATURES]], dim=1)
     splatted = splat(primitives, camera, channels, settings, render_depth=depth, absgrad=settings.absgrad)
     base = (splatted.colors[..., :3] + (1 - splatted.alpha) * background).clamp(0.0, 1.0)
     return {"rgb": base, "base_rgb": base, "depth": splatted.depth, "accumulation": splatted.alpha}, splatted
@@ -142,8 +141,7 @@ def render_view(
         images["rgb"] = compensate(head, base, splatted, background)
     elif weight > 0:
         at_scale, _ = render_view(source, camera.zoomed(zoom), background, settings, depth=False)
-        correction = at_scale["rgb"] - at_scale["base_rgb"]
-        images["rgb"] = base + weight * resize(correction, camera.height, camera.width)
+        images["rgb"] = base + weight * resize(at_scale["rgb"] - at_scale["base_rgb"], camera.height, camera.width)
     if not settings.training:
         images["rgb"] = images["rgb"].clamp(0.0, 1.0)
     return images, splatted

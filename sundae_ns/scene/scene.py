@@ -27,8 +27,7 @@ from sundae_ns.io.coordinates import Direction
 from sundae_ns.rasterize.interface import BackendName, select_backend
 from sundae_ns.scene.render import SHOWN_BACKGROUNDS, GaussianSource, RenderSettings, render_view
 
-Background = Literal["random", "black", "white"]
-"""Names of backgrounds; a scene that was trained over ``random`` ones is shown on nerfstudio's grey."""
+Background = Literal["random", "black", "white"]  # a scene trained over random ones is shown on nerfstudio's grey
 
 
 @dataclass(frozen=True, eq=False)

@@ -128,8 +128,8 @@ def front_views(scene: Scene, n: int = 7) -> list[Camera]:
     eyes = (poses_looking_at(up, torch.zeros_like(up), up)[:, :3] @ around).T
     best = int(_coarseness(probe, sizes, eyes, torch.zeros_like(eyes), "cover").argmin())
     step = len(eyes) // len(_AROUND[0])  # from one azimuth to the next
-    places = [middle + reach * eyes[(best + side * step) % len(eyes)] for side in (0, 1, -1, 2, -2, 3, -3)]
-    return [Camera.look_at(eye, middle, up, fov=50, width=640, height=480) for eye in places[:n]]
+    chosen = [middle + reach * eyes[(best + side * step) % len(eyes)] for side in (0, 1, -1, 2, -2, 3, -3)]
+    return [Camera.look_at(eye, middle, up, fov=50, width=640, height=480) for eye in chosen[:n]]
 
 
 def of_unit_size(scene: Scene, cameras: Sequence[Camera]) -> tuple[Scene, list[Camera], float]:

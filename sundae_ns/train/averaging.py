@@ -124,8 +124,7 @@ class Averaging(Callback):
         weights = weights_of(state)
         if state.step % AVERAGED_EVERY == 0:
             self._mean.count_in(weights)
-        replaced = self._mean.replace(weights) if state.step == last else {}
-        if replaced:
+        if state.step == last and (replaced := self._mean.replace(weights)):
             _log.info(f"step {state.step}: the weights are the mean of {self._mean.count} of the last steps")
             self._replaced = replaced if self._alone else {}
             if last >= run.schedule_length - 1:  # after a part, the mean goes on with the rest of the run

@@ -127,8 +127,7 @@ class HeadGain(NamedTuple):
     def of(cls, plain: Tried, head: Tried) -> HeadGain:
         """The gain between two trials that differ by the head."""
         (psnr, ssim), (better, closer) = (mean_quality(row.qualities) for row in (plain, head))
-        large_enough = ssim != closer and max(ssim, closer) < 1
-        rise = 10 * math.log10((1 - ssim) / (1 - closer)) if large_enough else None
+        rise = 10 * math.log10((1 - ssim) / (1 - closer)) if ssim != closer and max(ssim, closer) < 1 else None
         gain = cls(plain.count, better - psnr, closer - ssim, rise)
         if plain.bytes and head.bytes:
             gain = gain._replace(features=head.bytes[0] - plain.bytes[0], head=head.bytes[1])
@@ -182,15 +181,15 @@ def curve_of(tried: Sequence[Tried]) -> list[CurvePoint]:
     """
     if not tried or not tried[0].views:
         return []
-    counts, values = [row.count for row in tried], np.asarray([row.views for row in tried])  # [T, V, 4]
+    counts = [row.count for row in tried]
+    values = np.asarray([row.views for row in tried])  # [T, V, 4]
     pixels = values[0, :, 0] / values[0, :, 0].sum()
     halvings = -np.log2(np.asarray(counts, dtype=np.float64))[:, None]
     columns = []
     for index, weights in ((3, PSNR_WEIGHTS), (2, SSIM_WEIGHTS)):
         end = values[:, :, index]
         expected = weights[0] * end + weights[1] * halvings  # [T, V], up to a constant of the capture
-        means = np.where(np.isfinite(expected).all(1), expected @ pixels, -np.inf)
-        best = int(means.argmax())
+        best = int(np.where(np.isfinite(expected).all(1), expected @ pixels, -np.inf).argmax())
         losses, errors = zip(*(_paired(expected[best] - row, pixels) for row in expected), strict=True)
         columns.append(([float(end[best] @ pixels) - loss for loss in losses], losses, errors))
     (psnr, psnr_loss, psnr_error), (ssim, ssim_loss, ssim_error) = columns

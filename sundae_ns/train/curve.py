@@ -86,7 +86,7 @@ def curve_table(points: Sequence[CurvePoint]) -> list[str]:
     return table(["Gaussians", "packed, MB", "PSNR, dB", "below the best", "SSIM", "below the best"], rows, words=0)
 
 
-def _figures(value: float | None, loss: float | None, error: float | None, digits: int) -> list[str]:
-    if value is None or loss is None or error is None or not math.isfinite(loss):
+def _figures(value: float, loss: float, error: float, digits: int) -> list[str]:
+    if not math.isfinite(loss):
         return ["", "not finite"]
     return [f"{value:.{digits}f}", f"{loss:.{digits}f} ± {error:.{digits}f}"]

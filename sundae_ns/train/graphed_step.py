@@ -98,8 +98,7 @@ def _rows(state: TrainingState, trained: tuple[str, ...]) -> Iterator[tuple[str,
     gaussians: Any = state.gaussians
     for name in trained:
         yield name, gaussians, name
-        moments = state.optimizers[name].state[gaussians[name]]
-        yield from ((f"{name}.{moment}", moments, moment) for moment in MOMENTS)
+        yield from ((f"{name}.{moment}", state.optimizers[name].state[gaussians[name]], moment) for moment in MOMENTS)
     if state.densifying:
         running = state.densification
         yield from ((name, running, name) for name in STATISTICS if running.get(name) is not None)
@@ -280,7 +279,8 @@ class RecordedStep:
         numbers = pinned.to(state.device, non_blocking=True)
         # The prior of a field that grows is a mean over fewer rows than the buffers have.
         count = numbers[-1] if state.densifying and self._losses.prior_weight(state) > 0 else None
-        inputs, kind = replace(inputs, rates=numbers[:-1], count=count), _kind(state, inputs, settings)
+        kind = _kind(state, inputs, settings)
+        inputs = replace(inputs, rates=numbers[:-1], count=count)
         result = self._recordings.run(partial(self._step, state, held), inputs, settings, kind, held.addresses)
         if result is not None:
             state.info = {COUNTED: True}
@@ -310,22 +310,23 @@ class RecordedStep:
         self, state: TrainingState, held: _Held, inputs: StepInputs, settings: RenderSettings, capacity: Capacity | None
     ) -> StepResult:
         """One step on the buffers; all of its work is recorded."""
-        tensors, head, camera = self._buffers.tensors, settings.head, inputs.camera
+        tensors = self._buffers.tensors
         trained = {name: tensors[name] for name in held.trained}
         # With parameters that have no values, such as the features of a field without a head.
         empty = {name: value for name, value in state.gaussians.items() if name not in trained and value.numel() == 0}
         source = GaussianSource(Gaussians({**empty, **trained}, state.gaussians.encoding))
         loss, splatted, result = training_step(source, state, self._losses, inputs, settings)
-        network = [] if head is None else list(head.parameters())
-        counting, centers = state.densifying and "grad2d" in tensors, splatted.info["means2d"]
+        network = [] if settings.head is None else list(settings.head.parameters())
+        counting = state.densifying and "grad2d" in tensors
+        centers = splatted.info["means2d"]
         wanted = [*trained.values(), *network, *([centers] if counting else [])]
         grads = torch.autograd.grad(loss, wanted, allow_unused=True)
         with torch.no_grad():
             overflow = self._recordings.overflow(capacity)
             if counting:
-                of_centers, radii = centers.absgrad if settings.absgrad else grads[-1], splatted.info["radii"]
-                radii = radii if overflow is None else radii * (overflow == 0)
-                count_view(tensors, of_centers[0], radii[0], camera.width, camera.height)
+                of_centers = centers.absgrad if settings.absgrad else grads[-1]
+                radii = splatted.info["radii"] if overflow is None else splatted.info["radii"] * (overflow == 0)
+                count_view(tensors, of_centers[0], radii[0], inputs.camera.width, inputs.camera.height)
             assert inputs.rates is not None
             updates = self._updates(held, dict(zip([*trained.values(), *network], grads, strict=False)))
             adam_step(updates, inputs.rates, overflow)

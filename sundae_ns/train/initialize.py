@@ -110,8 +110,7 @@ def _warm_gaussians(options: Any, source: Path, frame: Frame | None) -> dict[str
         params["means"] = params["means"].float()  # survey coordinates are float64 until here
     columns = (options.sh_degree + 1) ** 2 - 1
     rest = params["features_rest"][:, :columns]
-    missing = rest.new_zeros(len(rest), columns - rest.shape[1], 3)
-    params["features_rest"] = torch.cat([rest, missing], dim=1)
+    params["features_rest"] = torch.cat([rest, rest.new_zeros(len(rest), columns - rest.shape[1], 3)], dim=1)
     _log.info(f"warm start: {len(params['means'])} Gaussians from {source}")
     return params
 

@@ -82,10 +82,10 @@ class Sweep:
         depth = torch.zeros_like(best)
         rows, columns = (torch.arange(side, device=best.device) for side in best.shape)
         rays = photo.rays(rows[:, None], columns)
-        lengths, correlations = rays.norm(dim=-1), _correlations(photo, others, rays, (1 / high, 1 / low))
+        lengths = rays.norm(dim=-1)
+        correlations = _correlations(photo, others, rays, (1 / high, 1 / low))
         # Normals of planes in camera coordinates, away from it: those that face it or nearly, and the ground's.
-        ground = photo.camera.viewmat[:3, :3] @ -normalize(self._up, dim=0)
-        for normal in [*photo.camera.K.new_tensor(_TURNED), ground]:
+        for normal in [*photo.camera.K.new_tensor(_TURNED), photo.camera.viewmat[:3, :3] @ -normalize(self._up, dim=0)]:
             facing = rays @ normal  # of a plane normal . X = 1 / s a pixel has the inverse depth facing * s
             steep = facing > STEEPEST * lengths
             if not steep.any():
@@ -193,8 +193,7 @@ def _neighbors(photos: Sequence[_Reduced], sparse: Tensor) -> list[tuple[list[in
     for i in range(len(photos)):
         angles = torch.rad2deg((directions * directions[i]).sum(dim=-1).clamp(-1, 1).acos())
         # Near directions tell little about depths; from far ones places look different.
-        weights = angles / (angles + 4) * torch.exp(-((angles / 36) ** 2))
-        shared = (weights * (visible & visible[i])).sum(dim=1)
+        shared = (angles / (angles + 4) * torch.exp(-((angles / 36) ** 2)) * (visible & visible[i])).sum(dim=1)
         shared[i] = -1
         order = torch.argsort(shared, descending=True, stable=True)[: len(photos) - 1].tolist()
         neighbors.append(([j for j in order[:NEIGHBORS] if shared[j] > 0], order[:CONFIRMING]))
@@ -272,11 +271,13 @@ def _box(image: Tensor) -> Tensor:
     """Sum over the patch of each pixel ``[N, C, H, W]``; in few additions, as pooling is slow on a CPU."""
     image = pad(image, (WINDOW // 2,) * 4)
     for axis in (2, 3):
-        length, power, size, offset = image.shape[axis] - WINDOW + 1, image, 1, 0
-        total = image.new_zeros(())
+        length = image.shape[axis] - WINDOW + 1
+        power, total = image, image.new_zeros(())
+        size, offset = 1, 0
         while size <= WINDOW:  # sums of 1, 2, 4 ... neighbours, joined by the binary digits of the window
             if WINDOW & size:
-                total, offset = total + power.narrow(axis, offset, length), offset + size
+                total = total + power.narrow(axis, offset, length)
+                offset += size
             if 2 * size <= WINDOW:
                 shorter = power.shape[axis] - size
                 power = power.narrow(axis, 0, shorter) + power.narrow(axis, size, shorter)

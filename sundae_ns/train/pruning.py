@@ -135,14 +135,14 @@ class PruningConfig(PruneRule):
         if self.keep_ratio is not None:
             kept_count(self.keep_ratio, 1)  # raises if the share is invalid
         self.check_at_least(every=1, prune_at=0, start=0, max_gaussians=1, target_gaussians=1, max_bytes=1)
-        cap, target, drop, off = self.max_gaussians, self.target_gaussians, self.max_drop, self.mode == "off"
+        cap, target, drop = self.max_gaussians, self.target_gaussians, self.max_drop
         continuous, no_count = self.mode == "continuous", self.keep_ratio is None and target is None
         over = cap is not None and target is not None and target > cap
         tried = "is set, and trials do not decide the number of Gaussians: set keep_ratio to None and mode to one-shot"
         refusals = [
             (continuous and self.stop < self.start, f"start ({self.start}) lies after stop ({self.stop}): swap them"),
             (continuous and no_count, "keep_ratio is None and mode is continuous: give 0.5, or target_gaussians"),
-            (off and (cap or target), "mode is off, which prunes nothing: set one-shot, or drop the number"),
+            (self.mode == "off" and (cap or target), "mode is off and prunes nothing: set one-shot, or drop the count"),
             (drop is not None and not self.decides, f"max_drop {tried}, as sundae does"),
             (self.max_bytes is not None and not self.decides, f"max_bytes {tried}, as sundae does"),
             (drop is not None and not 0 < drop < math.inf, f"max_drop is {drop}: give 0.1, or another number of dB"),
@@ -345,6 +345,5 @@ class FloaterRemoval(Callback):
         self._points = None
         eyes = torch.stack([camera.center for camera, _ in run.training_views()])
         pruner = Pruner(state.gaussians, state.optimizers, [state.densification])
-        removed = pruner.drop(near_cameras(pruner.params["means"], eyes, points), at_most=MOST)
-        if removed:
+        if removed := pruner.drop(near_cameras(pruner.params["means"], eyes, points), at_most=MOST):
             _log.info(f"step {state.step}: removed {removed:,} floaters right in front of a camera")

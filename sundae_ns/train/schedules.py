@@ -176,7 +176,8 @@ def set_schedule(config: Any, usual: Any, words: Iterable[str]) -> None:
     the length is no number of steps.
     """
     usual = deepcopy(usual)  # config may share parts with it
-    given, saved = given_options(words), config.load_dir or config.load_checkpoint
+    given = given_options(words)
+    saved = config.load_dir or config.load_checkpoint
     if saved is not None:
         run = _resumed_run(config, saved)
         if run is not None and usual is not None:
@@ -249,8 +250,7 @@ def fit_to_length(config: Any, usual: Any, given: Collection[str]) -> None:
         return
     model, usual_model = config.pipeline.model, usual.pipeline.model
     if model.warm_start is not None:
-        left = usual.max_num_iterations - usual_model.pruning.prune_at
-        steps_share = min(config.schedule_length / max(left, 1), 1.0)
+        steps_share = min(config.schedule_length / max(usual.max_num_iterations - usual_model.pruning.prune_at, 1), 1.0)
     config.optimizers = deepcopy(config.optimizers)  # methods share them with every configuration that tyro makes
     free = _free(config, usual, given, step_options(usual))
     for name in free:
@@ -276,7 +276,8 @@ def take_options(config: Any, run: Any, usual: Any, given: Collection[str]) -> l
     Options that were set by hand stay, see :func:`fit_to_length`. Returns a line for each option that the run has
     otherwise; ``ConfigError`` if one would change shapes or schedulers of the checkpoint.
     """
-    config.optimizers, differing = deepcopy(config.optimizers), []
+    config.optimizers = deepcopy(config.optimizers)
+    differing: list[str] = []
     names = [*step_options(usual), *_leaves(usual.pipeline.model, "pipeline.model")]
     free = set(_free(config, usual, given, names))
     for name in dict.fromkeys(names):
@@ -295,7 +296,8 @@ def take_options(config: Any, run: Any, usual: Any, given: Collection[str]) -> l
 def schedule_table(config: Any) -> list[tuple[str, str]]:
     """What happens when, for the log: pairs of a part of training and its steps."""
     model = config.pipeline.model
-    warm, head, pruning = model.warm_start is not None, model.head, model.pruning
+    head, pruning = model.head, model.pruning
+    warm = model.warm_start is not None
     sizes = [
         f"1/{2 ** (model.num_downscales - i)} until {(i + 1) * model.resolution_schedule:,}, "
         for i in range(0 if warm else model.num_downscales)

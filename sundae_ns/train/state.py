@@ -98,8 +98,7 @@ class TrainingState:
     def widen_head(self, num_features: int) -> bool:
         """Give the head this width of features, with fresh weights; returns whether it had another."""
         assert self.head is not None
-        changes = self.head.config.num_features != num_features
-        if changes:
+        if changes := self.head.config.num_features != num_features:
             self.head.resize(replace(self.head.config, num_features=num_features))
         return changes
 

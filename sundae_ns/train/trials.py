@@ -234,7 +234,8 @@ class Trials(Callback):
     def before_training(self, run: TrainingRun) -> None:
         """Hold views out; decide at once where trials cannot."""
         progress, state, indices = self.progress, run.state, run.view_indices()
-        num_views, several, max_bytes = len(indices), run.images_per_step > 1, self.config.max_bytes or math.inf
+        num_views, several = len(indices), run.images_per_step > 1
+        max_bytes = self.config.max_bytes or math.inf
         # A warm start skips the steps before the prune.
         progress.steps = progress.steps or (run.schedule_length or 0) + state.offset
         self._window = max(round(COUNT_SHARE * progress.steps), 1)
@@ -242,8 +243,8 @@ class Trials(Callback):
         self._judges = choice.spread_cameras(indices, min(choice.MOST_HELD_OUT, num_views // choice.HELD_OUT_EVERY), 0)
         state.pruning[VIEWS] = num_views
         if self.config.decides and "count" not in progress.chosen:
-            steps, left = len(SHARES) * self._window, _steps_of(run) - self.config.prune_at
-            steps += 2 * self._length if self.decides_head else 0
+            steps = len(SHARES) * self._window + (2 * self._length if self.decides_head else 0)
+            left = _steps_of(run) - self.config.prune_at
             obstacles = {
                 f"{num_views} training views are too few to compare counts": num_views < MANY_VIEWS,
                 "trials of counts need a single GPU": several,
@@ -387,11 +388,10 @@ class Trials(Callback):
             _log.info(f"step {state.step}: more training would harm other views; the remaining steps change nothing")
             return
         assert self.trial is not None
-        enabled, wide = state.head if state.head_enabled else None, len(self._heads) == 3
-        name = "plain" if enabled is None else "head"
-        if enabled is not None and wide and enabled.config.num_features == MORE_FEATURES:
-            name = "features"
-        row = Tried(stage, run.source.total, name, self.trial.length, [list(view) for view in self.measure(run)])
+        enabled = state.head if state.head_enabled else None
+        width = 0 if enabled is None else enabled.config.num_features
+        head = next(head for head in self._heads if self._widths[head] == width)
+        row = Tried(stage, run.source.total, head, self.trial.length, [list(view) for view in self.measure(run)])
         progress.tried.append(row)
         if stage in ("count", "tenth"):
             row.bytes = packed_size(state.gaussians, enabled)
@@ -402,7 +402,7 @@ class Trials(Callback):
             params = {name: value for name, value in state.gaussians.items() if enabled is not None or name != FEATURES}
             size = stored_bytes(params, None)
             row.bytes = [size, stored_bytes(params, enabled and enabled.config) - size]
-            self._try_head(run, name)
+            self._try_head(run, head)
         else:
             self._try_length(run)
 
@@ -432,7 +432,8 @@ class Trials(Callback):
     def _try_count(self, run: TrainingRun) -> None:
         """Try the next count or, on the usual share, no head and then a head; or choose."""
         progress, state = self.progress, run.state
-        number, tenth, curve = len(progress.of("count")), progress.of("tenth"), self.curve()
+        number = len(progress.of("count"))
+        tenth, curve = progress.of("tenth"), self.curve()
         if len(tenth) == 2:
             progress.chosen["tenth"] = choice.head_pays(curve, HeadGain.of(*tenth), self._tolerance)
             curve = self.curve()
@@ -441,10 +442,10 @@ class Trials(Callback):
         tries_head = self.decides_head and state.head is not None
         promising = number == 0 or (curve and not choice.is_lost(curve[-1], self._tolerance))
         if progress.stage != "tenth" and number < len(SHARES) and promising:
-            count, length = kept_count(SHARES[number], progress.full), self._window
+            count = kept_count(SHARES[number], progress.full)
             self._prune(run, count)
-            notify_pruned(state.schedulers, state.step, count, last=False, ends_at=state.step + length)
-            self.start(run, "count", length, self._judges, width=0)
+            notify_pruned(state.schedulers, state.step, count, last=False, ends_at=state.step + self._window)
+            self.start(run, "count", self._window, self._judges, width=0)
         elif tries_head and curve and len(tenth) < 2 and (self.config.max_bytes or self._count_of(curve)[0] > usual):
             self._prune(run, usual)
             limit_rise(state.schedulers, round(RISE_SHARE * self._length))

@@ -194,7 +194,7 @@ IMPOSSIBLE = [
     ({"keep_ratio": None, "target_gaussians": 5, "max_drop": 0.1}, f"max_drop {UNTRIED}"),
     ({**CONTINUOUS, "max_drop": 0.1}, f"max_drop {UNTRIED}"),
     ({**CONTINUOUS, "keep_ratio": None}, "keep_ratio is None and mode is continuous"),
-    ({"mode": "off", "max_gaussians": 4}, "mode is off, which prunes nothing"),
+    ({"mode": "off", "max_gaussians": 4}, "mode is off and prunes nothing"),
     ({**CONTINUOUS, "max_gaussians": 4, "target_gaussians": 5}, "is more than max_gaussians"),
 ]
 

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.core.errors import PackError
-from sundae_ns.core.files import replacing
+from sundae_ns.core.files import write_bytes
 from sundae_ns.core.gaussians import FEATURES, SPLAT_NAMES, finite_mask, num_gaussians
 from sundae_ns.io.budget import afford
 from sundae_ns.io.pack import container, entropy
@@ -96,8 +96,7 @@ def write_fitted(path: Path, scene: PackedScene, codecs: Codecs) -> PackReport:
     ``PackError`` if values are not finite, or the codecs do not fit the scene.
     """
     packed, sections = pack_bytes(scene, codecs)
-    with replacing(path) as partial:
-        partial.write_bytes(packed)
+    write_bytes(path, packed)
     sections["header"] = len(packed) - sum(sections.values())
     return PackReport(num_gaussians(scene.gaussians), len(packed), sections)
 
