@@ -75,7 +75,8 @@ class Camera(NamedTuple):
         if not min(fx, fy) > 0:
             raise ConfigError(f"the focal lengths are {fx:g} and {fy:g}; give positive numbers of pixels")
         checked = numbers(pose.detach() if isinstance(pose, Tensor) else pose, "pose", (3, 4), (4, 4))
-        given, axes = pose if isinstance(pose, Tensor) else checked, checked[:3, :3]
+        given = pose if isinstance(pose, Tensor) else checked
+        axes = checked[:3, :3]
         far = (axes.T @ axes - torch.eye(3, dtype=axes.dtype, device="cpu")).abs().max() > 0.25
         if far or axes.det() < 0 or (checked[3:, :3].abs() > 1e-6).any():
             raise ConfigError("the first three columns of the pose are not a rotation; give right-handed unit axes")

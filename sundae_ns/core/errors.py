@@ -98,8 +98,9 @@ def reading(
     except SundaeError:
         raise
     except Exception as error:
-        said, system = getattr(error, "strerror", None) or one_line(error), isinstance(error, OSError) and error.errno
-        what = f"cannot be read ({said}); {missing}" if system else f"is not {kind} ({said}); {remedy}"
+        said = getattr(error, "strerror", None) or one_line(error)
+        of_system = isinstance(error, OSError) and error.errno
+        what = f"cannot be read ({said}); {missing}" if of_system else f"is not {kind} ({said}); {remedy}"
         with suppress(OSError, ValueError), regular(path).open("rb") as file:
             first = file.read(32).lower()
             what = next((other for begin, other in _STAND_INS.items() if first.startswith(begin)), what)
@@ -121,8 +122,7 @@ def regular(path: Path) -> Path:
 def rank_ended(error: BaseException) -> str:
     """What ended a rank, which stopped the others, by an exception of ``torch.multiprocessing``; and the remedy."""
     rank, signal = getattr(error, "error_index", 0), getattr(error, "signal_name", None)
-    last = (str(error).strip().splitlines() or [""])[-1]
-    if last.startswith(__name__ + "."):
+    if (last := (str(error).strip().splitlines() or [""])[-1]).startswith(__name__ + "."):
         return f"rank {rank}: {last.partition(': ')[2]}"  # our own errors already name the remedy
     remedy = "resume from the newest checkpoint with --load-dir, on fewer GPUs with a smaller --machine.num-devices"
     return f"rank {rank} ended ({f'killed by {signal}' if signal else last}) and stopped the others; {remedy}"

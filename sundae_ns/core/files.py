@@ -124,7 +124,6 @@ def write_video(path: Path, frames: Iterable[Image.Image], *, frames_per_second:
         for count, image in enumerate(frames):
             if count == 0:
                 stream.width, stream.height = image.size
-            frame = av.VideoFrame.from_image(image).reformat(format="yuv420p", dst_colorspace=1)
-            container.mux(stream.encode(frame))
+            container.mux(stream.encode(av.VideoFrame.from_image(image).reformat(format="yuv420p", dst_colorspace=1)))
         container.mux(stream.encode(None))
     return count + 1

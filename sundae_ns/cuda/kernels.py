@@ -50,8 +50,7 @@ def compile_cubin(file: str, architecture: str, options: Sequence[str] = ()) -> 
     check(nvrtc.nvrtcCreateProgram(byref(program), read_source(file).encode(), file.encode(), 0, None, None))
     try:
         flags = [f"--gpu-architecture={architecture}".encode(), *(option.encode() for option in options)]
-        result = nvrtc.nvrtcCompileProgram(program, len(flags), (c_char_p * len(flags))(*flags))
-        if result != 0:
+        if (result := nvrtc.nvrtcCompileProgram(program, len(flags), (c_char_p * len(flags))(*flags))) != 0:
             check(nvrtc.nvrtcGetProgramLogSize(program, byref(size)))
             log = ctypes.create_string_buffer(size.value)
             check(nvrtc.nvrtcGetProgramLog(program, log))
@@ -126,7 +125,8 @@ def _module(file: str, options: tuple[str, ...], device: torch.device) -> c_void
     """A compiled file, loaded once for all of its kernels: compiling takes up to a second."""
     major, minor = torch.cuda.get_device_capability(device)
     code = compile_cubin(file, f"sm_{major}{minor}", options)
-    driver, module = _library("cuda"), c_void_p()
+    driver = _library("cuda")
+    module = c_void_p()
     with torch.cuda.device(device):
         # The driver's calls need torch's context on this thread; work on the device creates it.
         torch.zeros(1, device=device)

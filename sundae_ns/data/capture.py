@@ -106,8 +106,7 @@ def check_transforms(path: Path, *, splits: Sequence[str] = ()) -> dict[str, Any
     known = {str(Path(frame["file_path"])) for frame in frames}
     for split in splits if listed else ():
         name = f"{split}_filenames"
-        files = meta.get(name)
-        if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
+        if not isinstance(files := meta.get(name), list) or not all(isinstance(file, str) for file in files):
             remedy = f"add {name} as a list of paths, or remove all such lists"
             raise DataError(f"{path.name} lists images for {', '.join(listed)}, but none for {split}; {remedy}")
         if lost := [file for file in files if str(Path(file)) not in known]:

@@ -106,7 +106,8 @@ def write_smaller(images: Path, advance: Advance = lambda _: None, *, masks: boo
     """Write ``images_2``, ``images_4``, ``images_8`` beside a folder, and more until one has 1,600 pixels at most."""
     # Odd sizes are rounded down, as nerfstudio rounds those of cameras. Masks get no new values.
     paths = sorted(images.iterdir())
-    longest, factors = max(max(check_image(path, mask=masks)) for path in paths), [2, 4, 8]
+    longest = max(max(check_image(path, mask=masks)) for path in paths)
+    factors = [2, 4, 8]
     while longest / factors[-1] > LONGEST_SIDE:
         factors.append(2 * factors[-1])
     for path in paths:

@@ -59,7 +59,9 @@ def read_images(model: Path, kinds: Sequence[str] = ("txt", "bin")) -> dict[int,
     if not (present := [kind for kind in kinds if (model / f"cameras.{kind}").exists()]):
         near = beside(model / "cameras.bin")
         raise DataError(f"{model} holds neither cameras.bin nor cameras.txt{near}; give --colmap-path another folder")
-    kind, cameras, images, numbers = present[0], dict[int, ColmapCamera](), dict[int, ColmapImage](), dict[str, int]()
+    kind = present[0]
+    cameras, images = dict[int, ColmapCamera](), dict[int, ColmapImage]()
+    numbers = dict[str, int]()
     with _content(model / f"cameras.{kind}") as content:
         for number, name, width, height, params in _cameras(content, kind == "txt"):
             where = f"{model / f'cameras.{kind}'}, camera {number}"
@@ -168,7 +170,8 @@ def _images(content: bytes, text: bool) -> Iterator[tuple[int, tuple[float, ...]
 
 def _rows(content: bytes, *, images: bool = False) -> list[list[str]]:
     """Words of the entries of a text. An image has a second line, and a name that may have spaces."""
-    lines, rows = map(str.strip, re.split(r"\r\n|\r|\n", content.decode("utf-8-sig"))), []
+    lines = map(str.strip, re.split(r"\r\n|\r|\n", content.decode("utf-8-sig")))
+    rows = []
     for line in lines:
         if line and not line.startswith("#"):
             rows.append(line.split(maxsplit=9 if images else -1))

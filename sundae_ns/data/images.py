@@ -62,8 +62,8 @@ def opened(path: Path) -> Image.Image:
     if image.format == "PNG":
         image.close()
         content = path.read_bytes()  # of a file, Pillow asks for as many bytes as a chunk states
-        image, end = Image.open(BytesIO(content)), max(content.find(b"IDAT"), 0)
-        if (at := content.find(b"\0\0\0\4cICP", 0, end)) >= 0:
+        image = Image.open(BytesIO(content))
+        if (at := content.find(b"\0\0\0\4cICP", 0, max(content.find(b"IDAT"), 0))) >= 0:
             image.info["cicp"] = content[at + 8 : at + 12]
     elif "progressive" in image.info and (scans := path.read_bytes().count(b"\xff\xda")) > 200:  # each takes its time
         raise ValueError(f"it has {scans:,} scans")
@@ -111,13 +111,14 @@ def to_srgb(image: Image.Image) -> Image.Image:
         raise DataError(f"an image has pixels of type {image.mode}; convert it to RGB")
     if is_srgb(image):
         return image
-    convert, base = _conversion(image), image
+    convert = _conversion(image) or (lambda same: same)
+    base = image
     alpha = image.convert("RGBA").getchannel("A") if image.has_transparency_data else None
     if image.mode.startswith("I;16"):
         tags = getattr(image, "tag_v2", {})  # of a TIFF: its bits, which may be 12, and 0 if white is 0
         share = np.asarray(image) / (2.0 ** tags.get(258, [16])[0] - 1)
         base = Image.fromarray(np.round(255 * np.abs((tags.get(262) == 0) - share)).astype(np.uint8))
-    base = (convert or (lambda same: same))(base.convert(_MODES[image.mode]))
+    base = convert(base.convert(_MODES[image.mode]))
     if alpha is not None:
         base = base.convert("RGB")
         base.putalpha(alpha)

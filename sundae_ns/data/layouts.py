@@ -70,7 +70,8 @@ def _colmap_layout(data: Path, model: str, num_models: int) -> Layout:
     if (images := next((folder for folder in candidates if (folder / names[0]).is_file()), None)) is None:
         where = f"which its model {model} states, in {', '.join(_IMAGES)}"
         raise DataError(f"{data} has no image {names[0]}, {where}; put it there")
-    longest, downscale = max(check_image(images / names[0])), 1
+    longest = max(check_image(images / names[0]))
+    downscale = 1
     while longest / downscale > LONGEST_SIDE and (Path(f"{images}_{2 * downscale}") / names[0]).is_file():
         downscale *= 2
     folder = images.relative_to(data).as_posix()
@@ -102,21 +103,18 @@ def no_transforms(data: Path) -> DataError:
     """The error for a path without a ``transforms.json``, with advice that fits its contents."""
     if data.is_file():
         return DataError(f"{data} is a file, not a capture; sundae poses makes a capture of a video")
-    inner = next((path for path in entries(data) if (path / "transforms.json").is_file()), None)
-    models = models_in(data)
     advice = f"{data} has no transforms.json"
     if (data / _BLENDER).is_file():
         advice += f"; it is in Blender's layout ({_BLENDER}): add `blender-data` to ns-train"
     elif is_model(data):
         advice = f"{data} is a COLMAP model without its images; give the folder that holds both"
-    elif models:
+    elif models := models_in(data):
         advice += f"; it is in COLMAP layout: add {_words(data, models)} to ns-train"
-    elif inner is not None:
+    elif inner := next((path for path in entries(data) if (path / "transforms.json").is_file()), None):
         advice += f", but {inner} has; give that folder"
     else:
-        folder = shlex.quote(f"./{data}" if str(data).startswith("-") else str(data))
-        make = f"make a capture of images with `sundae poses {folder} -o CAPTURE`"
-        advice += f"{beside(data / 'transforms.json')}; {make}"
+        path = shlex.quote(f"./{data}" if str(data).startswith("-") else str(data))
+        advice += f"{beside(data / 'transforms.json')}; make a capture of images with `sundae poses {path} -o CAPTURE`"
     return DataError(advice)
 
 

@@ -144,8 +144,8 @@ def photo_of(path: Path) -> Photo:
             orientation = images.orientation_in(image)
             as_it_is = kind in _COPIED and orientation == 1 and images.is_srgb(image)
             lens = _lens(image.getexif())
-            told = f"{image.info.get('xmp')} {lens}".upper()
-            kind_of_model(next((key for key in ("EQUIRECTANGULAR", "CYLINDRICAL") if key in told), "OPENCV"), str(path))
+            text = f"{image.info.get('xmp')} {lens}".upper()
+            kind_of_model(next((key for key in ("EQUIRECTANGULAR", "CYLINDRICAL") if key in text), "OPENCV"), str(path))
     if kind not in (*_COPIED, *_CONVERTED):
         raise DataError(f"{path} is a {kind} file by its contents; save it as JPEG or PNG, or remove it")
     check_shape(path, size)
@@ -173,7 +173,8 @@ def _lens(exif: Image.Exif) -> tuple[str, ...]:
 
 def masks_of(photos: Sequence[Photo], folder: Path) -> list[Path]:
     """The mask of each photo, by its name, in ``folder``, the same subfolder there, or a folder so named beside it."""
-    masks, root = list[Path](), Path(os.path.commonpath([photo.path.parent for photo in photos]))
+    root = Path(os.path.commonpath([photo.path.parent for photo in photos]))
+    masks: list[Path] = []
     for path, _, wanted, _, _ in photos:
         names = (path.name, f"{path.name}.png", f"{path.stem}.png", f"{path.stem}.jpg")
         folders = folder / path.parent.relative_to(root), path.parent / folder.name, folder

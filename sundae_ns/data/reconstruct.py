@@ -118,8 +118,8 @@ def find_poses(request: Request, report: Reporter, warn: Warn = print) -> Placed
 def _keep_or_clear(request: Request, files: Sequence[Path]) -> None:
     """Clear the working folder, unless it was made of the same files with the same options."""
     times = [(str(path.absolute()), path.stat().st_size, path.stat().st_mtime_ns) for path in files]
-    stated = {"matching": request.matching, "frames": request.frames, "files": times}
-    asked, path = json.dumps(stated, indent=1) + "\n", request.work / "request.json"
+    asked = json.dumps({"matching": request.matching, "frames": request.frames, "files": times}, indent=1) + "\n"
+    path = request.work / "request.json"
     if path.is_file() and path.read_text(encoding="utf-8", errors="replace") == asked:
         return
     for entry in request.work.iterdir():
@@ -233,8 +233,7 @@ def _reconstruct(work: Path, images: Path, count: int, advance: Advance) -> list
         options.num_threads, options.random_seed, options.min_model_size = threads(), 0, LEAST_PHOTOS
         callbacks = {"initial_image_pair_callback": lambda: advance(2), "next_image_callback": lambda: advance(1)}
         module.incremental_mapping(database, images, partial, options, **callbacks)
-        made = _models(partial)
-        if made and (not models or len(_posed(made[0])) > 1.1 * len(_posed(models[0]))):
+        if (made := _models(partial)) and (not models or len(_posed(made[0])) > 1.1 * len(_posed(models[0]))):
             models, best = made, partial
         if models and len(_posed(models[0])) >= 0.95 * count:
             break

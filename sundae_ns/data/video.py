@@ -39,8 +39,7 @@ def is_video(path: Path) -> bool:
 def check_video(path: Path, warn: Warn = str) -> None:
     """Raise ``DataError`` if a video cannot be decoded, has too few frames, or colours that cannot be converted."""
     length, aspect, tracks = _facts(path)
-    first = next(_frames(path), None)
-    if first is None:
+    if (first := next(_frames(path), None)) is None:
         raise DataError(f"{path} has no frame that can be decoded; {_CONVERT}")
     if length < LEAST_PHOTOS:
         raise DataError(f"{path} has {length} frames, and camera poses need {LEAST_PHOTOS} or more; give a longer one")
@@ -150,8 +149,7 @@ def _sharpest(path: Path, count: int, length: int) -> Iterator[Any]:
     # A file may hold more frames than it states; they belong to the last stretch.
     stretches = groupby(enumerate(_frames(path)), lambda item: min(item[0] * count // length, count - 1))
     for _, frames in stretches:
-        _, first = next(frames)
-        yield max(chain([first], (frame for number, frame in frames if number % every == 0)), key=sharpness)
+        yield max(chain([next(frames)[1]], (frame for number, frame in frames if number % every == 0)), key=sharpness)
 
 
 def sharpness(frame: Any) -> float:

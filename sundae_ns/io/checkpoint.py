@@ -189,8 +189,7 @@ def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor]) 
     counts = sorted({state[name].shape[0] for name in expected if name.startswith(_PREFIX)})
     if len(counts) != 1 or counts[0] == 0:
         raise CheckpointError(f"the checkpoint has parameters of {counts} Gaussians; give another")
-    running = state[EXTRA_STATE]["running"]
-    pruning, densification = (running.get(name) for name in ("pruning", "densification"))
+    pruning, densification = (state[EXTRA_STATE]["running"].get(name) for name in ("pruning", "densification"))
     numbers = [state[EXTRA_STATE].get("step"), *(pruning.values() if isinstance(pruning, Mapping) else [None])]
     if not all(isinstance(value, int) for value in numbers) or not isinstance(densification, Mapping):
         raise CheckpointError(_NO_CLOCK)
@@ -260,7 +259,8 @@ def _check_pickle(pickled: bytes) -> None:
     if len(pickled) > 1 << 21:  # a second's work; real ones are much smaller, as tensors lie beside them
         raise ValueError(f"its structure has {len(pickled):,} bytes")
     ranks: dict[Any, int] = {}  # nesting depth of each tuple, by its index in the pickle's memo
-    rank, is_tuple = 0, False
+    rank = 0
+    is_tuple = False
     for operation, argument, _ in pickletools.genops(pickled):
         rank = max(rank, ranks.get(argument, 0)) if "GET" in operation.name else rank
         if is_tuple and "PUT" in operation.name:
@@ -283,7 +283,8 @@ def _scalar(dtype: np.dtype[Any], content: bytes) -> Any:
 
 def _check_tensors(loaded: Any) -> None:
     """Refuse tensors larger than their storage, whose copy would fill memory."""
-    visited, waiting = set[int](), [loaded]
+    visited = set[int]()
+    waiting = [loaded]
     while waiting:
         value = waiting.pop()
         if isinstance(value, Tensor) and value.numel() * value.element_size() > value.untyped_storage().nbytes():

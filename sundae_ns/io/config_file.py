@@ -97,8 +97,7 @@ def find_capture(config: Any, folder: Path) -> None:
         return
     names = ("output_dir", "experiment_name", "method_name", "timestamp")
     before = Path(*(str(getattr(config, name, "")) for name in names))
-    moved = Path(os.path.normpath(folder / os.path.relpath(data, before)))
-    if moved.exists():
+    if (moved := Path(os.path.normpath(folder / os.path.relpath(data, before)))).exists():
         datamanager.data = moved
 
 
@@ -154,8 +153,7 @@ def _value(path: Path, *keys: str) -> Any:
 
 def model_options(path: Path) -> dict[str, Any]:
     """Options of the model in a run's ``config.yml``; ``CheckpointError`` if it is no configuration of a run."""
-    options = _value(path, "pipeline", "model")
-    if not isinstance(options, dict):
+    if not isinstance(options := _value(path, "pipeline", "model"), dict):
         raise CheckpointError(f"{path} is not a run's config.yml; give the folder of a run")
     return options
 
@@ -175,8 +173,7 @@ def capture_and_source(path: Path) -> tuple[Path | None, Path | None]:
 
 def schedule_length(path: Path) -> int:
     """Number of steps of a run's schedule; ``CheckpointError`` if it is no configuration of a run of ours."""
-    length = _value(path, "schedule_length")
-    if not isinstance(length, int):
+    if not isinstance(length := _value(path, "schedule_length"), int):
         raise CheckpointError(f"{path} states no length of its schedule; give a run of sundae")
     return length
 

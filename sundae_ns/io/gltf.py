@@ -298,7 +298,8 @@ def _values(document: Json, binary: memoryview, index: object) -> NDArray[np.flo
         raise ValueError("it has sparse or empty accessors")
     data = _view(document, binary, accessor["bufferView"])
     kind, columns = np.dtype(_COMPONENTS[accessor["componentType"]]), _TYPES[accessor["type"]]
-    rows, width = _index(accessor["count"]), kind.itemsize * columns
+    rows = _index(accessor["count"])
+    width = kind.itemsize * columns
     stride = _index(document["bufferViews"][accessor["bufferView"]].get("byteStride", width))
     start = _index(accessor.get("byteOffset", 0))
     if (start + (rows - 1) * stride + width if rows else 0) > len(data) or stride < width:

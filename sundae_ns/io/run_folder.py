@@ -23,6 +23,7 @@ from sundae_ns.core.files import locked, write_text
 from sundae_ns.io.checkpoint import newest_step
 from sundae_ns.io.config_file import capture_and_source, config_of, schedule_length
 
+FRAME_FILE = "dataparser_transforms.json"  # of nerfstudio
 LOCK = "training.lock"
 PRUNES = "prune.json"  # record of the prunes, which a resumed run does not repeat
 _log = logging.getLogger(__name__)
@@ -39,7 +40,7 @@ def files_of(run: Path) -> list[Path]:
     if run.is_file() and run.name != "config.yml":
         return [run]
     folder = config_of(run).parent
-    return [folder / name for name in ("config.yml", "nerfstudio_models", "dataparser_transforms.json", PRUNES)]
+    return [folder / name for name in ("config.yml", "nerfstudio_models", FRAME_FILE, PRUNES)]
 
 
 def reserve(run: Path, busy: str = "trains in {}; wait for it, or give another --timestamp") -> int:

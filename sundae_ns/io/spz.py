@@ -80,8 +80,9 @@ def write_spz(path: Path, params: Mapping[str, Tensor], marks: Marks = UNMARKED)
         write(partial, data, version=3, fractional_bits=bits)  # more programs read version 3 than 4
         raw = bytearray(gzip.decompress(partial.read_bytes()))
         raw[14] |= marks.antialiased  # flags, for which gsply 0.4 has no option
-        packed, stated = gzip.compress(bytes(raw), mtime=0), "\n".join(comments_of(marks)).encode()
-        partial.write_bytes(_COMMENTED + packed[4:10] + stated + b"\0" + packed[10:])
+        packed = gzip.compress(bytes(raw), mtime=0)
+        comments = "\n".join(comments_of(marks)).encode()
+        partial.write_bytes(_COMMENTED + packed[4:10] + comments + b"\0" + packed[10:])
 
 
 def read_spz(path: Path) -> tuple[dict[str, Tensor], Marks]:

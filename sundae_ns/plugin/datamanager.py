@@ -279,8 +279,11 @@ def undistorting(paths: Sequence[Path]) -> Callable[..., Result]:
     """
 
     def undistort(camera: Any, distortion_params: Any, data: Any, image: Any, K: Any) -> Result:
-        intrinsics, mask, kind = K.copy(), data.get("mask"), int(camera.camera_type)
-        result, cause = None, "has a distortion that leaves no image"
+        intrinsics = K.copy()
+        mask = data.get("mask")
+        kind = int(camera.camera_type)
+        result = None
+        cause = "has a distortion that leaves no image"
         if kind == CameraType.PERSPECTIVE.value and distortion_params[3]:
             result = _of_brown(intrinsics, distortion_params, image, mask)
         else:

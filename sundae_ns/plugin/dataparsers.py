@@ -35,7 +35,7 @@ from sundae_ns.data.layouts import no_model, no_transforms
 from sundae_ns.data.lenses import DISTORTION, INTRINSICS, KINDS, PERSPECTIVE, Lens, lens_of, with_focal_lengths
 from sundae_ns.data.photos import copies
 from sundae_ns.io.ply import read_point_cloud
-from sundae_ns.scene.load_save import FRAME_FILE
+from sundae_ns.io.run_folder import FRAME_FILE
 from sundae_ns.train.progress import show_log
 
 show_log()  # all commands that train or open a run load this module
@@ -129,8 +129,7 @@ def stray_cameras(centres: Array, points: Callable[[], Array | None] = lambda: N
     # Up to one camera in five is a stray one; where there are more, they are part of the capture.
     usual = float(np.sort(distances)[len(centres) - 1 - max(1, len(centres) // 5)])
     far = (distances > STRAY * usual) & (usual > 0)
-    cloud = points() if far.any() else None
-    if cloud is not None and len(cloud):
+    if far.any() and (cloud := points()) is not None and len(cloud):
         far &= distances > STRAY * float(np.median(np.linalg.norm(cloud - middle, axis=1)))
     return far
 
@@ -187,14 +186,16 @@ class _PosedParser:
         gives those of the capture ``[M, 3]`` in the coordinates of the poses.
         """
         matrices = [rigid(np.array(frame["transform_matrix"], dtype=np.float64), where) for frame in frames]
-        centres, robust = np.array([matrix[:3, 3] for matrix in matrices]), getattr(self.config, "robust", False)
-        step, centred = _float32_step(centres) if robust else 0.0, self.config.center_method != "none"
+        centres = np.array([matrix[:3, 3] for matrix in matrices])
+        self._robust = getattr(self.config, "robust", False)
+        step = _float32_step(centres) if self._robust else 0.0
+        centred = self.config.center_method != "none"
         if step > COARSE_STEP and not centred:
             farthest = np.float32(np.abs(_distances_of(centres)[0]).max())
             what = f"{where}: the cameras stand {farthest:.3g} from the origin, where float32 numbers are"
             raise DataError(f"{what} {np.spacing(farthest):.2g} apart; leave out --center-method none")
         self.offset = _distances_of(centres)[0] if step > FINE_STEP and centred else None
-        self._points, self._robust = points, robust
+        self._points = points
         for frame, matrix in zip(frames, matrices, strict=True):
             if self.offset is not None:
                 matrix[:3, 3] -= self.offset
@@ -356,15 +357,15 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
     axis is mirrored, or a focal length belongs to no lens.
     """
     kinds = cameras.camera_type.flatten()
-    unknown = ~torch.isin(kinds, torch.tensor(list(TYPES.values()), dtype=kinds.dtype))
-    if unknown.any():
+    if (unknown := ~torch.isin(kinds, torch.tensor(list(TYPES.values()), dtype=kinds.dtype))).any():
         what = f"{next(compress(names, unknown)).name} is of type {CameraType(int(kinds[unknown][0])).name}"
         raise DataError(f"the camera of {what}; cut its images into perspective ones, such as cube faces")
     if (mirrored := torch.linalg.det(cameras.camera_to_worlds[:, :, :3]) < 0).any():
         which = f"{next(compress(names, mirrored)).name} mirrors an axis ({mirrored.sum()} of {len(names)} do)"
         raise DataError(f"the pose of {which}; negate one column of its rotation")
     sizes = torch.cat([cameras.width, cameras.height], dim=1).clamp_min(1)
-    centre, focal = torch.cat([cameras.cx, cameras.cy], dim=1), cameras.fx[:, 0] / sizes[:, 0]
+    centre = torch.cat([cameras.cx, cameras.cy], dim=1)
+    focal = cameras.fx[:, 0] / sizes[:, 0]
     # Views of 178 and of 0.06 degrees; principal points far outside, or as shares of the image.
     aside = (centre / sizes - 0.5).abs()
     strange = focal.ne(focal.clamp(0.01, 1000)) | (aside.amax(1) > 1.5) | ((centre.amax(1) <= 1) & (sizes.amin(1) > 8))
@@ -404,16 +405,14 @@ def check_tests(train: Any, test: Any) -> None:
         which = f"{min(shared).name} is a training image and a test view ({len(shared)} of {len(names)} test views are)"
         _log.warning(f"{which}, so figures are better than those of new views; list each image once, in one split")
     centres = torch.cat([data.cameras.camera_to_worlds[:, :, 3] for data in (train, test)]).double().cpu()
-    far = torch.from_numpy(stray_cameras(centres.numpy()))[-len(names) :]
-    if far.any():
+    if (far := torch.from_numpy(stray_cameras(centres.numpy()))[-len(names) :]).any():
         which = f"{next(compress(names, far)).name}, a test view, stands far from all others"
         _log.warning(f"the camera of {which} ({int(far.sum())} of {len(names)} do); check its pose, or remove the view")
 
 
 def check_projection(camera: Cameras) -> None:
     """Raise ``DataError`` for a camera that asks for another projection, as a camera path may; ours are perspective."""
-    kind = CameraType(int(camera.camera_type.flatten()[0]))
-    if kind != CameraType.PERSPECTIVE:
+    if (kind := CameraType(int(camera.camera_type.flatten()[0]))) != CameraType.PERSPECTIVE:
         what = f"the camera is of type {kind.name.lower()}, and only perspective images can be drawn"
         raise DataError(f"{what}; set camera_type to perspective, for a panorama render the six faces of a cube")
 
@@ -426,7 +425,8 @@ def warn_of_cloud(points: Tensor, cameras: Cameras) -> None:
     """
     points = points[torch.isfinite(points).all(dim=1)].cpu()
     points = points[torch.linspace(0, max(len(points) - 1, 0), min(2000, len(points))).long()]
-    empty, values = 0, (cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.width, cameras.height)
+    empty = 0
+    values = cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.width, cameras.height
     lenses = torch.cat([value.float() for value in values], dim=-1).cpu()
     for pose, (fx, fy, cx, cy, width, height) in zip(cameras.camera_to_worlds.cpu(), lenses.tolist(), strict=True):
         x, y, z = ((points - pose[:, 3]) @ pose[:, :3]).unbind(dim=1)

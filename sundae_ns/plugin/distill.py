@@ -159,7 +159,8 @@ class Distillation:
 
     def _try_head(self, steps: int, on_step: Callable[[int], object]) -> bool:
         """Train without and with the head from the same start, and keep the head if it pays; False if interrupted."""
-        state, quality = self.state, list[float]()
+        state = self.state
+        quality = list[float]()
         assert state.head is not None
         start = state.snapshot(head=True)
         for before, starts_at in ((0, math.inf), (steps, -math.inf)):
@@ -207,10 +208,9 @@ class Distillation:
         state = self.state
         head = state.head if state.head_enabled else None
         names = [name for name in state.gaussians if name != FEATURES or head is not None]
-        gaussians = {name: state.gaussians[name].detach() for name in names}
         return dataclasses.replace(
             self._teacher,
-            gaussians=Gaussians(gaussians, state.gaussians.encoding),
+            gaussians=Gaussians({name: state.gaussians[name].detach() for name in names}, state.gaussians.encoding),
             head=head,
             trained_focal=None if head is None else state.trained_focal,
         )
@@ -244,7 +244,8 @@ class Distillation:
             saved = torch.load(path, map_location=state.device, weights_only=True)
             if saved["options"] != self._options:
                 raise ValueError("other options")
-            self.step, self.gain = int(saved["step"]), saved["gain"]
+            self.step = int(saved["step"])
+            self.gain = saved["gain"]
             if not any(name.startswith("networks.") for name in saved["model"]):
                 state.remove_head()
             self._modules.load_state_dict(saved["model"])

@@ -164,8 +164,7 @@ class BatchOptimizers(Optimizers):
         """Average the gradients of the head over the ranks, and step. Collective."""
         ranks = dist.get_world_size()
         if HEAD in param_groups:
-            gradients = [value.grad for value in self.parameters[HEAD] if value.grad is not None]
-            if gradients:
+            if gradients := [value.grad for value in self.parameters[HEAD] if value.grad is not None]:
                 mean = _summed(torch.cat([gradient.flatten() for gradient in gradients])) / ranks
                 for gradient, values in zip(gradients, mean.split([gradient.numel() for gradient in gradients])):
                     gradient.copy_(values.view_as(gradient))
@@ -190,8 +189,7 @@ class Ranks:
         if self.count == 1:
             return config
         config = copy.deepcopy(config)
-        viewer_only = config.vis in ("viewer", "viewer_legacy")
-        config.vis = "tensorboard" if viewer_only else config.vis.removeprefix("viewer+")
+        config.vis = "tensorboard" if config.vis in ("viewer", "viewer_legacy") else config.vis.removeprefix("viewer+")
         CONSOLE.quiet = self.rank != 0
         if config.machine.device_type == "cuda":
             torch.cuda.set_device(self.rank)

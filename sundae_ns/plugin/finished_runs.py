@@ -104,8 +104,7 @@ def load_model(
     if scene is not None:
         opened = _open_file(path, scene, data or (None if like is None else like.capture))
     else:
-        config = config_of(path)
-        if config.name != "config.yml" or not config.is_file():
+        if (config := config_of(path)).name != "config.yml" or not config.is_file():
             raise no_scene(path)
         opened = _open_run(config, data, split)
     if split == "test":
@@ -139,9 +138,9 @@ def _open_file(path: Path, scene: Scene, data: Path | None) -> Opened:
         scene = replace(scene, background_color="white")  # as `sundae train` reads this layout
     model = model_of(scene).to(fastest_device())
     manager = config.setup(device=model.device, test_mode="test", world_size=1, local_rank=0)
-    stated = scene.meta.get("source")
-    source = stated if isinstance(stated, dict) else {}
-    method, step = str(source.get("method") or "sundae"), source.get("step")
+    source = stated if isinstance(stated := scene.meta.get("source"), dict) else {}
+    method = str(source.get("method") or "sundae")
+    step = source.get("step")
     steps = step + 1 if isinstance(step, int) else 0
     return Opened(model, manager, path, data, method, path.name, steps, packed_bytes=path.stat().st_size)
 
@@ -151,8 +150,7 @@ def _open_run(path: Path, data: Path | None, split: Literal["test", "val"]) -> O
     newest, loaded = checkpoint.read_newest(path.parent / config.relative_model_dir)
     manager = config.pipeline.datamanager = _datamanager_config(config.pipeline.datamanager)
     stock = config.pipeline.model
-    foreign = not isinstance(stock, SundaeModelConfig)
-    if foreign:
+    if foreign := not isinstance(stock, SundaeModelConfig):
         # The grid corrects training images only; test views are rendered without it.
         shared = {**_shared(stock, SplatfactoModelConfig), "use_bilateral_grid": False}
         parts: Any = {"pruning": PruningConfig(mode="off"), "head": HeadConfig(mode="off")}
@@ -163,7 +161,8 @@ def _open_run(path: Path, data: Path | None, split: Literal["test", "val"]) -> O
         raise DataError(f"the capture {capture} is missing; give its folder with --data")
     manager.data = capture
     pipeline: Any = config.pipeline.setup(device=fastest_device(), test_mode=split)
-    model, step = cast(SundaeModel, pipeline.model), int(loaded["step"])
+    model = cast(SundaeModel, pipeline.model)
+    step = int(loaded["step"])
     if foreign:
         put_scene(model, scene_of_checkpoint(newest, loaded, path))
         model.step = step
@@ -269,8 +268,7 @@ def load_run(run: Path, *, max_cameras: int = 100, data: Path | None = None) -> 
 def describe_capture(manager: SundaeDatamanagerConfig) -> dict[str, Any] | None:
     """Plain values to parse, split and scale the same capture again; None where :func:`stated_capture` refuses them."""
     parser = manager.dataparser
-    kind = next((name for name, known in _PARSERS.items() if type(parser) is known), None)
-    if kind is None:
+    if (kind := next((name for name, known in _PARSERS.items() if type(parser) is known), None)) is None:
         return None
     options = {name: getattr(parser, name, default) for name, default in _parser_options(_PARSERS[kind]).items()}
     options = {name: value.as_posix() if isinstance(value, Path) else value for name, value in options.items()}

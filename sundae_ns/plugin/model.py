@@ -187,9 +187,8 @@ class SundaeModel(SplatfactoModel):
         for callback in self.train_callbacks:
             callback.prepare_loading(self.state, extra["extensions"].get(callback.name, {}))
         checkpoint.check_model_state(state_dict, self.state_dict())
-        n = state_dict["gauss_params.means"].shape[0]
         for value in self.gauss_params.values():
-            value.data = value.data.new_zeros(n, *value.shape[1:])
+            value.data = value.data.new_zeros(len(state_dict["gauss_params.means"]), *value.shape[1:])
         self._start = Start()
         # Not SplatfactoModel's own loader, which replaces parameters and resets the step.
         return super(SplatfactoModel, self).load_state_dict(state_dict, **kwargs)
@@ -262,7 +261,8 @@ class SundaeModel(SplatfactoModel):
 
     def contribution(self, datamanager: SundaeDatamanager, count: int | None = None) -> Tensor:
         """Summed blending weight of each Gaussian ``[N]``; see :func:`sundae_ns.scene.render.contribution`."""
-        cameras, settings = self.training_views(datamanager), self.render_settings(training=False)
+        cameras = self.training_views(datamanager)
+        settings = self.render_settings(training=False)
         return contribution(self.source, cameras, self.background_color, settings, count, console=CONSOLE)
 
     def count_curve(self) -> list[CurvePoint]:
@@ -312,8 +312,8 @@ class SundaeModel(SplatfactoModel):
 
     def truth(self, batch: dict[str, Any], outputs: Mapping[str, Any], downscale: int | None = None) -> Tensor:
         """The true image of outputs, over their background ``[H, W, 3]``; by default at the resolution of this step."""
-        image, factor = batch["image"], self._get_downscale_factor() if downscale is None else downscale
-        image = image.float() / 255 if image.dtype == torch.uint8 else image
+        factor = self._get_downscale_factor() if downscale is None else downscale
+        image = batch["image"].float() / 255 if batch["image"].dtype == torch.uint8 else batch["image"]
         image = image if factor == 1 else resize_image(image, factor)
         image = crop_image(image.to(self.device), outputs.get("window"))
         return self.composite_with_background(image, outputs["background"])
@@ -415,7 +415,8 @@ class NerfstudioRun:
     def photos(self) -> Iterator[Photo]:
         """All training views in full size; transparent pixels are masked."""
         for camera, batch in self._datamanager.cameras(self.view_indices()):
-            photo, image = self._photo(camera, batch), batch["image"]
+            photo = self._photo(camera, batch)
+            image = batch["image"]
             if image.shape[-1] == 4:
                 opaque = (image[..., 3] > (127 if image.dtype == torch.uint8 else 0.5)).to(photo.target.device)
                 photo = photo._replace(mask=opaque if photo.mask is None else photo.mask & opaque)

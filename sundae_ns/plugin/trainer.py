@@ -76,14 +76,12 @@ class SundaeTrainerConfig(TrainerConfig):
         if datamanager.data is None:  # an unset path is nerfstudio's example
             owners.append((datamanager.dataparser, "data"))
         for owner, name in owners:
-            value = getattr(owner, name, None)
-            if isinstance(value, Path):
+            if isinstance(value := getattr(owner, name, None), Path):
                 setattr(owner, name, value.absolute())
 
     def get_base_dir(self) -> Path:
         """Folder of the run: where a command of nerfstudio has found it, for a run that was copied or moved."""
-        run = loaded_run(sys.argv)
-        if run is None or not (run / self.relative_model_dir).is_dir():
+        if (run := loaded_run(sys.argv)) is None or not (run / self.relative_model_dir).is_dir():
             base: Path = super().get_base_dir()
             return base
         find_capture(self, run)
@@ -225,8 +223,7 @@ class SundaeTrainer(Trainer):
         model = self.model
         camera, batch = self._datamanager.next_train(step)
         inputs = model.step_inputs(camera, batch)
-        result = self._recorded(model.state, inputs, model.render_settings(training=True))
-        if result is None:
+        if (result := self._recorded(model.state, inputs, model.render_settings(training=True))) is None:
             self._recorded = None
             return None
         model.exposure_compensation.observe(result.images["rgb"], inputs.target, inputs.mask, batch)

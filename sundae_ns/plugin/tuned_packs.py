@@ -106,8 +106,8 @@ def finetune_within(run: Path, scene: PackedScene, steps: int, most: int | None,
         return first
     power = largest(float, lambda power: pack_at(first[0], FINETUNED, power).bytes, most)
     again = finetune(run, scene, scaled(FINETUNED, power), steps, **options)
-    found = largest(partial(pack_at, *again), lambda pack: pack.bytes, most)
-    return found.scene, found.codecs
+    pack = largest(partial(pack_at, *again), lambda pack: pack.bytes, most)
+    return pack.scene, pack.codecs
 
 
 class RoundedTraining:
@@ -148,8 +148,7 @@ class RoundedTraining:
         gaussians = {name: self.exact[name] for name in self._codecs.gaussians}
         head = {name: self.exact[name] for name in self.head}
         with torch.no_grad():  # rounded in place, because recorded graphs read the parameters there
-            rounded = self._codecs.rounded(gaussians) | self._codecs.rounded_head(head)
-            for name, value in rounded.items():
+            for name, value in (self._codecs.rounded(gaussians) | self._codecs.rounded_head(head)).items():
                 self.rounded[name].copy_(value)
         model = self._model
         loss, _, result = training_step(model.source, model.state, model.losses, inputs, settings)
@@ -188,7 +187,8 @@ class Judge:
     def __init__(self, run: Path, data: Path | None) -> None:
         opened = load_model(run, data)
         chosen = spread(len(opened.cameras), 8)
-        self._model, self.cameras, self.all_cameras = opened.model, len(chosen), len(opened.cameras)  # Measured, of all
+        self._model = opened.model
+        self.cameras, self.all_cameras = len(chosen), len(opened.cameras)  # Numbers of views: measured, and all
         self._cameras, self._truths = [opened.cameras[i] for i in chosen], [opened.truths[i] for i in chosen]
         self.before = self._quality()  # Of the run itself
 
@@ -270,7 +270,8 @@ class Search:
 
 def best_pack(searches: Sequence[Search], most_drop: float) -> Candidate:
     """The smallest pack that loses at most ``most_drop`` dB, of searches of one run; ``ConfigError`` if none does."""
-    packs, failure = list[Candidate](), ConfigError("there is no pack")
+    packs = list[Candidate]()
+    failure = ConfigError("there is no pack")
     for search in reversed(searches):
         try:
             packs.append(search.better_than(most_drop))

@@ -90,7 +90,8 @@ class ViewerControls(torch.nn.Module):
         self.keep_ratio = ViewerSlider("Keep ratio", 1.0, 0.01, 1.0, 0.01, cb_hook=self._show_expected, hint=hint)
         hint = "Number of Gaussians and, where trials have found it, what so few lose if they are trained on"
         self.expected = ViewerText("Expected", "", disabled=True, hint=hint)
-        rules, hint = list(get_args(RuleName)), "Rule of the previewed prune; the head is disabled in a preview"
+        hint = "Rule of the previewed prune; the head is disabled in a preview"
+        rules = list(get_args(RuleName))
         self.rule = ViewerDropdown("Rule", rules[0], rules, hint=hint)
         self.control = ViewerControl()  # gives access to the viewer, and so to the training views
         self.training_gaussians = False  # Whether a trainer changes the field
@@ -120,8 +121,7 @@ class ViewerControls(torch.nn.Module):
 
         ``crop`` are the Gaussians in the crop box, bool ``[N]``; ``compensate`` counts outside of a viewer.
         """
-        preview = self.preview()
-        if preview is not None:
+        if (preview := self.preview()) is not None:
             gaussians, mask = preview.gaussians, preview.decision.mask
             if crop is not None:
                 gaussians, mask = gaussians.rows(crop[mask]), mask & crop
@@ -138,7 +138,8 @@ class ViewerControls(torch.nn.Module):
 
         The caller holds nerfstudio's lock on the model, so training in another thread waits.
         """
-        name, ratio = self.rule.value, round(float(self.keep_ratio.value), 6)
+        name = self.rule.value
+        ratio = round(float(self.keep_ratio.value), 6)
         if ratio >= 1 or not in_viewer():
             return None
         with self._lock:

@@ -144,8 +144,7 @@ class Pruner:
 
     def drop(self, mask: Tensor, *, at_most: float) -> int:
         """Remove the Gaussians under a mask, bool ``[N]``, unless more than ``at_most`` of all; returns how many."""
-        count = int(mask.sum())
-        if not 0 < count <= at_most * self.total:
+        if not 0 < (count := int(mask.sum())) <= at_most * self.total:
             return 0
         keep(self.params, self.optimizers, self.states, ~mask)
         return count

@@ -43,8 +43,7 @@ def near_cameras(means: Tensor, eyes: Tensor, points: Tensor) -> Tensor:
     distances = _distances(finite, eyes)
     free = FREE * distances.sort().values[int(NEAREST * (len(finite) - 1))]
     near = _distances(means, eyes) < free
-    about = finite[distances < (1 + REACH) * free]
-    near[near.clone()] = _distances(means[near], about, SUPPORT) > REACH * free
+    near[near.clone()] = _distances(means[near], finite[distances < (1 + REACH) * free], SUPPORT) > REACH * free
     return near
 
 

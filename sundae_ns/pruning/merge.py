@@ -73,7 +73,8 @@ def pair_labels(params: Mapping[str, Tensor], graph: NeighborGraph, weight: Tens
     ``weight`` ``[N]`` is not negative. Labels ``[N]`` are as :func:`sundae_ns.core.merging.merge` takes them: the index
     of a member, in each merge that of the heavier group; -1 for Gaussians that are dropped.
     """
-    device, n, values = graph.indices.device, graph.N, as_gaussians(params).as_harmonics()
+    device, n = graph.indices.device, graph.N
+    values = as_gaussians(params).as_harmonics()
     w = weight.to(device).double().nan_to_num(0.0).clamp_min(0)
     label = torch.arange(n, device=device)
     order = torch.sort(w, stable=True).indices
@@ -247,7 +248,8 @@ def merged(
     logits = params["features_dc"].detach()
     colors = logits.sigmoid()
     values = merge({**params, "features_dc": colors}, labels, weight)
-    kept, mixed = mask.to(logits.device), values["features_dc"]
+    kept = mask.to(logits.device)
+    mixed = values["features_dc"]
     # Unmerged colours keep their logits: a saturated colour does not survive the round trip.
     values["features_dc"] = torch.where(mixed == colors[kept], logits[kept], rgb_to_logit(mixed))
     return values

@@ -72,7 +72,8 @@ class PruneRule:
     def validate(self) -> None:
         """Raise a ConfigError that names the first invalid option and its valid values."""
         for name, hint in get_type_hints(type(self)).items():
-            value, kinds = getattr(self, name), (hint, *get_args(hint))
+            value = getattr(self, name)
+            kinds = hint, *get_args(hint)
             choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
             kind = {int: Integral, float: Real}.get(hint, object)
             if not (value in choices or callable(value) if choices else isinstance(value, kind)):

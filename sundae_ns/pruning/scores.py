@@ -29,8 +29,7 @@ def score(
     function as score returns another shape.
     """
     if callable(rule.score):
-        values = rule.score(params)
-        if values.shape != (len(params["means"]),):
+        if (values := rule.score(params)).shape != (len(params["means"]),):
             raise DataError(f"a score has shape {list(values.shape)} for {len(params['means'])} Gaussians: return [N]")
         return values.double()
     if rule.score == "response":
@@ -97,8 +96,7 @@ def pixel_detail(image: Tensor, cells: float) -> Tensor:
         for y, x in ((half, 0), (0, half)):  # columns, then rows
             values = avg_pool2d(values, (2 * y + 1, 2 * x + 1), 1, (y, x), count_include_pad=False)
         variance = (values[-1] - values[:-1].square().sum(dim=0)).clamp_min(0)
-    mean = variance.mean()
-    if not mean > 0:
+    if not (mean := variance.mean()) > 0:
         return torch.ones_like(variance).to(image.dtype)
     # A flat pixel has a weight too, a quarter of the root mean square: flat areas need some Gaussians.
     weights = (variance + 0.25**2 * mean).sqrt()

@@ -86,7 +86,8 @@ def _systematic_sample(probabilities: Tensor, count: int, start: float) -> Tenso
     uncertain, taken = (~certain).nonzero().squeeze(1), certain.nonzero().squeeze(1)
     if not (wanted := count - len(taken)):
         return taken
-    sums, steps = probabilities[uncertain].cumsum(0), torch.arange(wanted)
+    sums = probabilities[uncertain].cumsum(0)
+    steps = torch.arange(wanted)
     marks = (start + steps.double()) * (sums[-1] / wanted)
     # Rounding must not lose the last draw, nor draw one Gaussian twice.
     drawn = torch.searchsorted(sums, marks, right=True).minimum(steps + len(uncertain) - wanted)

@@ -50,8 +50,7 @@ class GsplatBackend:
 
         columns, rows = -(-width // TILE), -(-height // TILE)
         _, pairs, ids = isect_tiles(splats.means2d, splats.radii, splats.depths, TILE, columns, rows)
-        starts = isect_offset_encode(pairs, len(splats.means2d), columns, rows)
-        return GsplatLists(width, height, starts, ids)
+        return GsplatLists(width, height, isect_offset_encode(pairs, len(splats.means2d), columns, rows), ids)
 
     def _blend(self, splats: Splats, colors: Tensor, lists: GsplatLists, absgrad: bool) -> tuple[Tensor, Tensor]:
         """Images ``[V, H, W, C]`` and alphas ``[V, H, W, 1]`` of colours ``[V, N, C]``."""

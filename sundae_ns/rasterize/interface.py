@@ -210,8 +210,7 @@ def numba_problem() -> str | None:
     try:
         ones = torch.ones(1, 4, dtype=torch.float32, device="cpu")
         camera = Camera(ones[0].diag(), ones[0, :3].diag(), 1, 1, 1.0)
-        inputs = Inputs(ones[:, :3], ones, ones[:, :3], ones[:, 0], ones[:, :1], camera)
-        rasterize(inputs, backend=_cpu_backend())
+        rasterize(Inputs(ones[:, :3], ones, ones[:, :3], ones[:, 0], ones[:, :1], camera), backend=_cpu_backend())
     except ImportError as error:
         return f"numba does not import ({one_line(error)}); pip install numba"
     except Exception as error:  # versions, processors and settings that numba refuses raise errors of many kinds

@@ -105,11 +105,9 @@ def project(inputs: Inputs) -> Projection:
     with torch.no_grad():
         spread = (0.25 * (xx - yy).square() + xy * xy).clamp(min=0.01).sqrt()
         radii = torch.ceil(3.0 * (0.5 * (xx + yy) + spread).sqrt()).clamp(max=MAX_RADIUS)
-        size = means2d.new_tensor([width, height])
-        inside = (means2d + radii[:, None] > 0) & (means2d - radii[:, None] < size)
+        inside = (means2d + radii[:, None] > 0) & (means2d - radii[:, None] < means2d.new_tensor([width, height]))
         radii = (radii * inside.all(dim=-1) * in_range).to(torch.int32)
-    covars2d = torch.stack([xx, xy, yy], dim=-1)
-    return Projection(means2d, covars2d, conics, camera[:, 2], compensations, radii)
+    return Projection(means2d, torch.stack([xx, xy, yy], dim=-1), conics, camera[:, 2], compensations, radii)
 
 
 def _limit_slope(slope: Tensor, focal: Tensor, centre: Tensor, size: int) -> Tensor:

@@ -140,8 +140,8 @@ class Subject:
     @classmethod
     def of_run(cls, opened: Opened) -> Subject:
         """A run, or a file in the test views of a capture."""
-        model, known = opened.model, ("scene", "method", "variant", "seed", "steps", "prune_s")
-        facts: dict[str, Any] = {name: getattr(opened, name) for name in known}
+        model = opened.model
+        facts = {name: getattr(opened, name) for name in ("scene", "method", "variant", "seed", "steps", "prune_s")}
         peak = model.state.pruning["peak"] or None
         facts |= {"source": str(opened.source), "keep_ratio": opened.kept, "peak_primitives": peak}
         settings, cameras = model.render_settings(training=False), [model.camera_of(each) for each in opened.cameras]

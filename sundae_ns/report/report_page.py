@@ -66,8 +66,7 @@ def choose_cameras(qualities: Sequence[float], most: int) -> list[int]:
     NaN counts as worst.
     """
     ranked = sorted(range(len(qualities)), key=lambda i: -math.inf if math.isnan(qualities[i]) else qualities[i])
-    ranks = np.linspace(0, len(ranked) - 1, min(len(ranked), max(most, 2))).round()
-    return sorted(ranked[int(rank)] for rank in ranks)
+    return sorted(ranked[int(i)] for i in np.linspace(0, len(ranked) - 1, min(len(ranked), max(most, 2))).round())
 
 
 def error_map(rendering: Tensor, truth: Tensor, size: tuple[int, int] | None = None) -> Image.Image:
@@ -123,7 +122,8 @@ def _image(image: Tensor, size: tuple[int, int]) -> Image.Image:
 
 def _encoded(image: Image.Image) -> str:
     """An image as a ``data:`` address: PNG if it has a palette, else WebP."""
-    file, kind = BytesIO(), "png" if image.mode == "P" else "webp"
+    file = BytesIO()
+    kind = "png" if image.mode == "P" else "webp"
     image.save(file, kind, optimize=True, lossless=max(image.size) <= EXACT_SIDE, quality=90)
     return f"data:image/{kind};base64,{base64.b64encode(file.getvalue()).decode()}"
 

@@ -19,12 +19,12 @@ from sundae_ns.io import checkpoint, formats
 from sundae_ns.io.config_file import find_config, model_options, orientation_of
 from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.io.ply import Marks
+from sundae_ns.io.run_folder import FRAME_FILE
 from sundae_ns.scene.cameras import is_frame
 from sundae_ns.scene.page import opened_page, packed_of, shown_as, write_page
 from sundae_ns.scene.scene import Scene
 
 SUFFIXES = (*formats.FORMATS, ".sundae", ".html")  # of the files that save() writes
-FRAME_FILE = "dataparser_transforms.json"  # of nerfstudio, in the folder of a run
 
 
 def load(path: Path | str, *, device: torch.device | str = "cpu") -> Scene:

@@ -389,8 +389,8 @@ def fit_codecs(
     names = [name for name in (*SPLAT_NAMES, FEATURES) if name in gaussians]
     values = {name: as_matrix(gaussians[name]) for name in names}
     order, near = scene_order(values["means"])
-    whole = min(range(config.block, max(config.block // 2, 15), -1), key=lambda size: max(near % size, 16))
-    for block in (config.block, whole, *(max(config.block >> bits, 16) for bits in (2, 4, 6))):
+    filled = min(range(config.block, max(config.block // 2, 15), -1), key=lambda size: max(near % size, 16))
+    for block in (config.block, filled, *(max(config.block >> bits, 16) for bits in (2, 4, 6))):
         # What lies far away makes a block coarse: blocks that the near ones fill, and else smaller ones, mend that.
         config = replace(config, block=block)
         blocks, within = quantize_positions(values["means"][order], config.position_bits, block)
@@ -407,7 +407,8 @@ def fit_codecs(
     codecs: dict[str, Rotations | Transform] = {"quats": Rotations(config.rotation_step)}
     for name, option in _STEPS.items():
         if name != "quats" and name in values and values[name].size:
-            step, form = getattr(config, option), sensitivity.rows.get(name)
+            form = sensitivity.rows.get(name)
+            step = getattr(config, option)
             codecs[name] = fit_transform(values[name], step, centred=name != "features_rest", form=form)
     ordered = {name: torch.from_numpy(values[name]).reshape(gaussians[name].shape) for name in names}
     return ordered, Codecs(config, blocks, codecs, _fit_head(head, config.head_step, sensitivity.head))

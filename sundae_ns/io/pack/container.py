@@ -197,8 +197,7 @@ def encode(meta: Mapping[str, Any], arrays: Mapping[str, Array], *, unpacked: in
     parts = {name: [_deflated(plane) for plane in split_planes(array)] for name, array in little.items()}
     body = sum(len(part) for planes in parts.values() for part in planes)
     unpacked = max(unpacked, sum(array.nbytes for array in little.values()))
-    lacking = (unpacked - SPARE) // MAX_RATIO + 1 - body
-    if lacking > 0:
+    if (lacking := (unpacked - SPARE) // MAX_RATIO + 1 - body) > 0:
         little[PADDING] = np.zeros(lacking, np.uint8)
         parts[PADDING] = [little[PADDING].tobytes()]
     stored = {name: b"".join(planes) for name, planes in parts.items()}

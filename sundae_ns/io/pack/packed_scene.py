@@ -201,8 +201,7 @@ def _decode_head(file: _Sections) -> dict[str, Tensor]:
 def _decode_cameras(file: _Sections) -> dict[str, Tensor] | None:
     if "cameras/poses" not in file.arrays:
         return None
-    count = len(file.arrays["cameras/poses"])
-    arrays = {name: _array(file, "cameras", name, cameras=count) for name in CAMERAS}
+    arrays = {name: _array(file, "cameras", name, cameras=len(file.arrays["cameras/poses"])) for name in CAMERAS}
     arrays["sizes"] = arrays["sizes"].astype(np.int64)
     return {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
 

@@ -49,7 +49,8 @@ class CpuBackend:
         """See :meth:`.Backend.spherical_harmonics`."""
         _check(directions)
         outputs = (torch.empty_like(directions, memory_format=torch.contiguous_format),)
-        loops, options = (_evaluate, _evaluate_backward, MIN_PER_THREAD), (degree, rest.shape[1] * rest.requires_grad)
+        loops = _evaluate, _evaluate_backward, MIN_PER_THREAD
+        options = degree, rest.shape[1] * rest.requires_grad
         return cast("Tensor", _Loops.apply(loops, options, outputs, 1, directions, first, rest)[0])
 
 

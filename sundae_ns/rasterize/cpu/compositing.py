@@ -61,7 +61,8 @@ class _Composite(torch.autograd.Function):
         lists: Callable[[], Iterable[Lists]],
         absgrad: bool,
     ) -> tuple[Tensor, Tensor]:
-        (width, height), values = size, as_array(colors)
+        width, height = size
+        values = as_array(colors)
         tiles = -(-width // TILE) * -(-height // TILE)
         image, alpha = (np.zeros((height, width, channels), values.dtype) for channels in (values.shape[1], 1))
         ends = np.empty((2, tiles, _PIXELS), values.dtype)
@@ -70,7 +71,8 @@ class _Composite(torch.autograd.Function):
             parallel_for(_blend, len(region.longest_first), *arguments, min_per_thread=_MIN_TILES)
             ctx.lists = lists if before else [region].copy  # lists of several regions may exceed the memory
         ctx.save_for_backward(means2d, conics, opacities, colors)
-        ctx.ends, ctx.absgrad = ends, absgrad
+        ctx.ends = ends
+        ctx.absgrad = absgrad
         return torch.from_numpy(image), torch.from_numpy(alpha)
 
     @staticmethod
@@ -78,9 +80,11 @@ class _Composite(torch.autograd.Function):
     def backward(ctx: Any, grad_image: Tensor, grad_alpha: Tensor) -> tuple[Tensor | None, ...]:
         means2d, _, _, colors = ctx.saved_tensors
         needs_geometry, needs_colors = any(ctx.needs_input_grad[:3]), ctx.needs_input_grad[3]
-        absgrad, values = ctx.absgrad and needs_geometry, as_array(colors)
+        absgrad = ctx.absgrad and needs_geometry
+        values = as_array(colors)
         padded = -(-colors.shape[1] // _GROUP) * _GROUP
-        gradients, needs = (as_array(grad_image), as_array(grad_alpha)), (needs_geometry, needs_colors, absgrad, padded)
+        gradients = as_array(grad_image), as_array(grad_alpha)
+        needs = needs_geometry, needs_colors, absgrad, padded
         outputs = tuple(np.zeros(value.shape, values.dtype) for value in ctx.saved_tensors)
         absolute_grads = np.zeros(means2d.shape if absgrad else (0, 0, 0), values.dtype)
         for region in ctx.lists():

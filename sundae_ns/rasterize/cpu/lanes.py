@@ -189,8 +189,7 @@ def store(typing: Any, array: Any, index: Any, values: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         lanes = _broadcast(context, builder, arguments[2], values, Lanes(array.dtype))
-        address = _address(context, builder, array, *arguments[:2])
-        builder.store(lanes, address, align=array.dtype.bitwidth // 8)
+        builder.store(lanes, _address(context, builder, array, *arguments[:2]), align=array.dtype.bitwidth // 8)
         return context.get_dummy_value()
 
     return types.void(array, types.intp, values), generate
