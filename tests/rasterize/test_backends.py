@@ -452,7 +452,7 @@ def test_an_image_of_many_pairs_is_blended_by_regions(monkeypatch):
     compare(render(values, camera, F32, CPU), once, 0.0, 1e-5)
     half = len(regions) // 2
     assert len(regions) == 2 * half >= 10  # the backward pass makes them again
-    assert all(len(region.entries) <= 400 for region in regions)
+    assert all(len(region.ranks) <= 400 for region in regions)
     drawn_tiles = torch.cat([torch.from_numpy(region.longest_first) for region in regions[:half]])
     assert sorted(drawn_tiles.tolist()) == list(range(70))
     monkeypatch.setattr(tiles, "MOST_PAIRS", 0)  # a tile is not cut

@@ -91,8 +91,10 @@ class _Composite(torch.autograd.Function):
             parts = np.empty((len(region.ranks), padded + _MOMENTS * needs_geometry), values.dtype)
             arguments = (tuple(region), (values, *ctx.ends), gradients, needs, parts)
             parallel_for(_blend_backward, len(region.longest_first), *arguments, min_per_thread=_MIN_TILES)
-            summed = (tuple(region), parts, padded, outputs, absolute_grads)
-            parallel_for(_sum_slots, len(region.ids), *summed, min_per_thread=MIN_PER_THREAD)
+            # Each thread reads all lists, for its own Gaussians.
+            shares = max(1, min(torch.get_num_threads(), len(region.ids) // MIN_PER_THREAD))
+            summed = (shares, tuple(region), ctx.ends[1], parts, padded, outputs, absolute_grads)
+            parallel_for(_sum_entries, shares, *summed)
         if ctx.absgrad:
             means2d.absgrad = torch.from_numpy(absolute_grads) if absgrad else torch.zeros_like(means2d)
         return *map(torch.from_numpy, outputs), None, None, None
@@ -117,7 +119,7 @@ def _unclamped_alphas(dx: Any, dy: Any, row: Any) -> Any:
 def _blend(
     begin: int, end: int, lists: Any, colors: Any, image: Any, alpha_image: Any, transmittances: Any, last: Any
 ) -> None:
-    columns, tiles, starts, ranks, _, spans, ids, _, table = lists
+    columns, tiles, starts, ranks, spans, ids, table = lists
     number = table.dtype.type
     height, width, channels = image.shape
     x = load((np.arange(WIDTH) % TILE + 0.5).astype(table.dtype), 0)
@@ -191,7 +193,7 @@ def _any_unfinished(through: Any) -> bool:
 @compiled
 def _blend_backward(begin: int, end: int, lists: Any, blended: Any, gradients: Any, needs: Any, parts: Any) -> None:
     """Write the gradients of channels, the moments of dL/de and the absolute gradient of the centre of each entry."""
-    columns, tiles, starts, ranks, _, spans, ids, _, table = lists
+    columns, tiles, starts, ranks, spans, ids, table = lists
     colors, transmittances, last = blended
     grad_image, grad_alpha = gradients
     needs_geometry, needs_colors, absgrad, padded = needs
@@ -217,7 +219,6 @@ def _blend_backward(begin: int, end: int, lists: Any, blended: Any, gradients: A
                     grads[p // WIDTH, c, p % WIDTH] = grad_image[top + y, left + x_of_pixel, c]
                 alpha_grads[p] = grad_alpha[top + y, left + x_of_pixel, 0]
         start, deepest = starts[tile], int(blended_last.max())
-        parts[start + deepest : starts[tile + 1]] = 0
         for nth in range(deepest, 0, -1):
             entry = start + nth - 1
             gathered_at = (nth - 1) % _GATHERED
@@ -286,30 +287,37 @@ def _sum_channels(weights: Any, grads: Any, first: int, beyond: int, channel: in
 
 
 @compiled
-def _sum_slots(begin: int, end: int, lists: Any, parts: Any, padded: int, outputs: Any, absolute_grads: Any) -> None:
-    """Sum the slots of each Gaussian in float64, convert moments to gradients, and add them to the outputs."""
-    _, _, _, _, entries, _, ids, first_slots, table = lists
+def _sum_entries(
+    begin: int, end: int, shares: int, lists: Any, last: Any, parts: Any, padded: int, outputs: Any, absolute_grads: Any
+) -> None:
+    """Sum the blended entries of each Gaussian in float64, convert moments to gradients, and add them to the outputs.
+
+    The Gaussians are cut into ``shares``; these are numbers ``begin`` to ``end`` of them.
+    """
+    _, _, starts, ranks, _, ids, table = lists
     grad_means2d, grad_conics, grad_opacities, grad_colors = outputs
-    width = parts.shape[1]
-    sums = np.empty(width)
-    for rank in range(begin, end):
-        i = ids[rank]
-        sums[:] = 0
-        for slot in range(first_slots[rank], first_slots[rank + 1]):
-            for d in range(width):
-                sums[d] += parts[entries[slot], d]
+    first, beyond = len(ids) * begin // shares, len(ids) * end // shares
+    sums: Any = np.zeros((beyond - first, parts.shape[1]))
+    for tile in range(len(starts) - 1):
+        blended = min(starts[tile + 1] - starts[tile], int(last[tile].max()))
+        for entry in range(starts[tile], starts[tile] + blended):
+            if first <= ranks[entry] < beyond:
+                for d in range(parts.shape[1]):
+                    sums[ranks[entry] - first, d] += parts[entry, d]
+    for rank in range(first, beyond):
+        i, total = ids[rank], sums[rank - first]
         for c in range(grad_colors.shape[1]):
-            grad_colors[i, c] += sums[c]
-        if width == padded:  # only the colours have gradients
+            grad_colors[i, c] += total[c]
+        if len(total) == padded:  # only the colours have gradients
             continue
         xx, xy, yy = 2 * float(table[rank, HALF_XX]), table[rank, XY], 2 * float(table[rank, HALF_YY])
-        mx, my = sums[padded + 1], sums[padded + 2]
+        mx, my = total[padded + 1], total[padded + 2]
         grad_means2d[0, i, 0] += xx * mx + xy * my
         grad_means2d[0, i, 1] += xy * mx + yy * my
-        grad_conics[i, 0] -= 0.5 * sums[padded + 3]
-        grad_conics[i, 1] -= sums[padded + 4]
-        grad_conics[i, 2] -= 0.5 * sums[padded + 5]
-        grad_opacities[i] += sums[padded] / table[rank, OPACITY]
+        grad_conics[i, 0] -= 0.5 * total[padded + 3]
+        grad_conics[i, 1] -= total[padded + 4]
+        grad_conics[i, 2] -= 0.5 * total[padded + 5]
+        grad_opacities[i] += total[padded] / table[rank, OPACITY]
         if len(absolute_grads) > 0:
-            absolute_grads[0, i, 0] += sums[padded + 6]
-            absolute_grads[0, i, 1] += sums[padded + 7]
+            absolute_grads[0, i, 0] += total[padded + 6]
+            absolute_grads[0, i, 1] += total[padded + 7]

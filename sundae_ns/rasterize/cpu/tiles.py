@@ -5,9 +5,8 @@ grid. The lists here use a finer grid and leave out only Gaussians that cannot r
 image is the same, with fewer evaluations. (gsplat 1.5 fits the squares to the opacity instead, which also keeps the rim
 of opaque Gaussians from 3 to 3.33 sigma.)
 
-Gaussians are sorted by depth once and are then identified by their rank. A rank owns consecutive slots, one per tile
-that it can touch. They tell where its sums per tile stand, which the backward pass writes in list order, so that the
-sum over the tiles of a Gaussian has a fixed order.
+Gaussians are sorted by depth once and are then identified by their rank, which ascends in each list. The backward pass
+writes sums per tile in list order, so that the sum over the tiles of a Gaussian has a fixed order.
 """
 
 from __future__ import annotations
@@ -32,22 +31,20 @@ U, V, HALF_XX, XY, HALF_YY, OPACITY, LIMIT, HALF_WIDTH, HALF_HEIGHT = range(9)
 STEP = WIDTH // TILE  # Rows of pixels of a tile that are blended in one step
 ROUNDING = 1e-3  # Slack on exponents, so that rounding never drops a Gaussian that is blended
 MOST_PAIRS = 1 << 23
-"""Pairs of a tile and a Gaussian in memory at a time: 84 MB, and in a backward pass at least six times as much."""
+"""Pairs of a tile and a Gaussian in memory at a time: 50 MB, and in a backward pass at least three times as much."""
 MIN_PER_THREAD = 2_500  # Gaussians: below 0.1 ms of work, waking a thread costs more than it saves
 _DIGIT_BITS = 11  # bits per pass of the radix sort
 
 
 class Lists(NamedTuple):
-    """V visible Gaussians in those of the T tiles of an image, row by row, that are in a region; L slots."""
+    """V visible Gaussians in those of the T tiles of an image, row by row, that are in a region; L pairs of both."""
 
     columns: int
     longest_first: Any  # [B], int32: tiles with a list, the longest first
     starts: Any  # [T + 1], int64: start of each tile's list
     ranks: Any  # [L], int32, in list order
-    entries: Any  # [L], int32, in the order of the slots: where each stands in the lists
     spans: Any  # [L, 2], uint8, in list order: the steps of a tile that are touched, the last excluded
     ids: Any  # [V], int32: Gaussian of each rank
-    first_slots: Any  # [V + 1], int64: first slot of each rank
     table: Any  # [V, 9]: see the column names above
 
 
@@ -70,27 +67,26 @@ def tile_lists(projection: Projection, opacities: Tensor, width: int, height: in
         region = regions.pop()
         table = np.empty((count, 9), depths.dtype)
         boxes = np.empty((count, 4), np.int32)
-        first_intervals, first_slots = np.zeros((2, count + 1), np.int64)
+        first_intervals, num_tiles = np.zeros((2, count + 1), np.int64)
         parallel_for(_measure, count, ids, splats, region, table, boxes, first_intervals, min_per_thread=MIN_PER_THREAD)
         np.cumsum(first_intervals, out=first_intervals)
         halves = _halves(*region)
         pairs = int(first_intervals[-1])  # a Gaussian touches at least one tile in each of its columns
         if pairs <= MOST_PAIRS or not halves:
             intervals = np.empty((pairs, 2), np.int32)
-            touched = (table, boxes, first_intervals, intervals, first_slots)
+            touched = (table, boxes, first_intervals, intervals, num_tiles)
             parallel_for(_find_intervals, count, *touched, min_per_thread=MIN_PER_THREAD)
-            np.cumsum(first_slots, out=first_slots)
-            pairs = int(first_slots[-1])
+            pairs = int(num_tiles.sum())
         if not projection.means2d.requires_grad:
             check_pairs(listed + pairs, count, columns * rows)
         if pairs > MOST_PAIRS and halves:
             regions += halves
             continue
         listed += pairs
-        starts, ranks, entries, spans = _sort_by_tile(boxes, first_intervals, intervals, first_slots, columns, rows)
+        starts, ranks, spans = _sort_by_tile(boxes, first_intervals, intervals, columns, rows)
         lengths = np.diff(starts)
         longest_first = np.argsort(-lengths, kind="stable").astype(np.int32)[: np.count_nonzero(lengths)]
-        yield Lists(columns, longest_first, starts, ranks, entries, spans, ids, first_slots, table)
+        yield Lists(columns, longest_first, starts, ranks, spans, ids, table)
 
 
 def _halves(left: int, top: int, right: int, bottom: int) -> list[tuple[int, int, int, int]]:
@@ -204,10 +200,8 @@ def _touched_rows(table: Any, rank: int, left: int) -> tuple[float, float]:
 
 
 @compiled
-def _sort_by_tile(
-    boxes: Any, first_intervals: Any, intervals: Any, first_slots: Any, columns: int, rows: int
-) -> tuple[Any, Any, Any, Any]:
-    """Starts of the lists, and in list order (by tile, then by rank) the ranks, slots and touched steps."""
+def _sort_by_tile(boxes: Any, first_intervals: Any, intervals: Any, columns: int, rows: int) -> tuple[Any, Any, Any]:
+    """Starts of the lists, and in list order (by tile, then by rank) the ranks and touched steps."""
     starts: Any = np.zeros(columns * rows + 1, np.int64)
     for rank in range(len(first_intervals) - 1):
         for interval in range(first_intervals[rank], first_intervals[rank + 1]):
@@ -218,10 +212,8 @@ def _sort_by_tile(
                 row += 1
     for tile in range(columns * rows):
         starts[tile + 1] += starts[tile]
-    count = first_slots[-1]
-    ranks, entries, spans = np.empty(count, np.int32), np.empty(count, np.int32), np.empty((count, 2), np.uint8)
+    ranks, spans = np.empty(starts[-1], np.int32), np.empty((starts[-1], 2), np.uint8)
     ends: Any = starts.copy()
-    slot = 0
     for rank in range(len(first_intervals) - 1):
         for interval in range(first_intervals[rank], first_intervals[rank + 1]):
             first, beyond = intervals[interval, 0], intervals[interval, 1]
@@ -230,10 +222,9 @@ def _sort_by_tile(
             for _ in range(_num_tiles(first, beyond)):
                 tile = row * columns + column
                 entry = ends[tile]
-                ranks[entry], entries[slot] = rank, entry
+                ranks[entry] = rank
                 spans[entry, 0] = max(first - row * TILE, 0) // STEP
                 spans[entry, 1] = (min(beyond - row * TILE, TILE) + STEP - 1) // STEP
                 ends[tile] += 1
-                slot += 1
                 row += 1
-    return starts, ranks, entries, spans
+    return starts, ranks, spans
