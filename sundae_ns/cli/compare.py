@@ -71,7 +71,8 @@ def compare(
         raise ConfigError(f"--formats compares one scene with itself; leave out {scenes[1]}, or --formats")
     first = None if photos else load(scenes[0]).to(fastest_device())
     command = shlex.join(["sundae", *typed])
-    repeats = (5 if photos else 0) if repeats is None else repeats
+    if repeats is None:
+        repeats = 5 if photos else 0
     lpips = Lpips(lpips_net) if photos and lpips_weights(lpips_net)[1].is_file() else None
     unmeasured = f"LPIPS: the weights of its net ({lpips_net}) are missing; sundae doctor says where to put them."
     notes = [unmeasured] if photos and lpips is None else []
@@ -120,7 +121,6 @@ def compare(
         write_files({out / f"report.{kind}": text.encode(errors="backslashreplace") for kind, text in files.items()})
         print(f"wrote {out / 'report.html'}, for a browser ({len(page) / 1e6:.1f} MB), report.md, .csv and .json")
     means = {run.label: run.full.mean("psnr") for run in runs if run.full.views}
-    low = [] if min_psnr is None else [label for label, psnr in means.items() if psnr is None or psnr < min_psnr]
-    if low:
+    if low := [] if min_psnr is None else [label for label, psnr in means.items() if psnr is None or psnr < min_psnr]:
         print(f"below {min_psnr:g} dB: {', '.join(low)}", file=sys.stderr)
     return 1 if failures or low else 0

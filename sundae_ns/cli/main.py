@@ -78,16 +78,16 @@ def _dispatch(words: Sequence[str]) -> int:
         options[at:at] = [] if re.fullmatch(r"-?[\d.]+", "".join(options[at : at + 1])) else ["0.25"]
     # Only the module of this command: some import torch, which takes a second.
     run = getattr(importlib.import_module(f"sundae_ns.cli.{name}"), name)
-    said, later = io.StringIO(), wraps(run)(lambda *given, **named: partial(run, *given, **named))
+    messages, later = io.StringIO(), wraps(run)(lambda *given, **named: partial(run, *given, **named))
     try:
-        with redirect_stderr(said):
+        with redirect_stderr(messages):
             chosen = tyro.cli(later, prog=f"sundae {name}", args=options)
     except SystemExit as end:
         if not end.code:  # it was the help
             raise
         # Of a box of many lines, those that are not indented further; between its rules are parts.
-        rows = " ".join(re.findall(r"(?m)^[│ ] {1,5}(\S.*?)\.? *│?$", said.getvalue()))
-        text = (re.sub(r" [─-]{9,} ", "; ", rows) or said.getvalue()).replace("Expected 1 values", "Give one")
+        rows = " ".join(re.findall(r"(?m)^[│ ] {1,5}(\S.*?)\.? *│?$", messages.getvalue()))
+        text = (re.sub(r" [─-]{9,} ", "; ", rows) or messages.getvalue()).replace("Expected 1 values", "Give one")
         text = re.sub(r"(Argument helptext: .*)?For full helptext, \w+:? (.*)", r"\2 shows the options", text)
         raise ConfigError(re.sub(r"could not convert .*?: |invalid literal .*?: ", "no number: ", text)) from end
     return chosen()
@@ -130,8 +130,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for name in ("stdout", "stderr"):
             if getattr(sys, name) is None:  # it is closed; else the next file that opens would get its number
                 setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
-            stream = getattr(sys, name)
-            if isinstance(stream, io.TextIOWrapper):  # names of files may be no text
+            if isinstance(stream := getattr(sys, name), io.TextIOWrapper):  # names of files may be no text
                 stream.reconfigure(errors="backslashreplace")
         # Looking for garbage among the million objects of imports takes a sixth of the start, and 0.6 s of the end.
         gc.set_threshold(100_000)

@@ -110,8 +110,8 @@ def _interruptible(work: Callable[[], Placed], folder: Path) -> Placed:
             raise
         except KeyboardInterrupt:
             cursor = "\x1b[?25h\x1b[2K\r" if sys.stderr.isatty() else ""  # a bar hides it
-            said = "" if os.environ.get(STEP) else "sundae: interrupted; the same command continues here\n"
-            print(f"{cursor}{said}", end="", file=sys.stderr, flush=True)
+            message = "" if os.environ.get(STEP) else "sundae: interrupted; the same command continues here\n"
+            print(f"{cursor}{message}", end="", file=sys.stderr, flush=True)
             os._exit(130)
         except Exception as error:  # COLMAP raises many kinds
             remedy = f"remove {shlex.quote(word(folder))} and start again, or report it"

@@ -65,7 +65,8 @@ def run_logged(words: Sequence[str], log: Path | None = None, on_line: Callable[
     if sys.platform == "linux":
         prctl = ctypes.CDLL(None).prctl
         options |= {"preexec_fn": lambda: prctl(1, signal.SIGTERM)}  # PR_SET_PDEATHSIG
-    last, received = deque[str](maxlen=12), list[int]()
+    last = deque[str](maxlen=12)
+    received: list[int] = []
 
     def pass_on(number: int, frame: object) -> None:
         received.append(signal.SIGINT if number == signal.SIGINT else signal.SIGTERM)

@@ -117,11 +117,11 @@ def _distilled(edit: Edit, out: Path, steps: int | None) -> int:
 
         finished = training.train(after_step)
     if not finished:
-        said = "nothing is saved yet: the trial of the head had not ended"
+        message = "nothing is saved yet: the trial of the head had not ended"
         if training.step > 0:
             training.save(partial)
-            said = f"saved step {training.step:,} of {training.steps:,} as {partial}; the same command resumes"
-        print(f"sundae: interrupted; {said}", file=sys.stderr)
+            message = f"saved step {training.step:,} of {training.steps:,} as {partial}; the same command resumes"
+        print(f"sundae: interrupted; {message}", file=sys.stderr)
         return 130
     rows = torch.ones(training.state.gaussians.num_gaussians, dtype=torch.bool)
     left = sized._replace(source=partial, scene=training.result(), rows=rows).reduced(out)

@@ -98,9 +98,9 @@ def reading(
     except SundaeError:
         raise
     except Exception as error:
-        said = getattr(error, "strerror", None) or one_line(error)
+        reason = getattr(error, "strerror", None) or one_line(error)
         of_system = isinstance(error, OSError) and error.errno
-        what = f"cannot be read ({said}); {missing}" if of_system else f"is not {kind} ({said}); {remedy}"
+        what = f"cannot be read ({reason}); {missing}" if of_system else f"is not {kind} ({reason}); {remedy}"
         with suppress(OSError, ValueError), regular(path).open("rb") as file:
             first = file.read(32).lower()
             what = next((other for begin, other in _STAND_INS.items() if first.startswith(begin)), what)

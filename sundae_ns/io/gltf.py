@@ -135,7 +135,7 @@ def read_glb(path: Path) -> tuple[dict[str, Tensor], Marks]:
                 unpacked += _READ + len(transforms) * (_PLACE + sum(value.nbytes for value in gaussians.values()))
                 afford(unpacked, path.stat().st_size)
                 starts = range(_PLACED_AT_ONCE, len(transforms), _PLACED_AT_ONCE)
-                parts += [_placed(gaussians, some) for some in np.split(transforms, starts)]
+                parts += [_placed(gaussians, matrices) for matrices in np.split(transforms, starts)]
         except (AttributeError, IndexError, KeyError, TypeError) as error:
             raise ValueError("its JSON is not that of a glTF scene") from error
         if not parts:

@@ -96,22 +96,22 @@ def describe(
 
 def bytes_by_attribute(scene: Scene, path: Path) -> dict[str, int]:
     """Bytes of each part of a packed scene, a page or a .sog in its file; of others, of the Gaussians in fp32."""
-    parts = Counter[str]()
+    sizes = Counter[str]()
     if path.suffix.lower() == ".html":
         with opened_page(path) as packed:
-            parts |= bytes_by_attribute(scene, packed)
-        parts["page"] = path.stat().st_size - parts.total()
+            sizes |= bytes_by_attribute(scene, packed)
+        sizes["page"] = path.stat().st_size - sizes.total()
     elif kind_of(path) == "packed":
         for name, section in read_header(path).sections.items():
-            parts[name.split("/")[0]] += sum(section.parts)
+            sizes[name.split("/")[0]] += sum(section.parts)
     elif kind_of(path) == "sog":
         with zipfile.ZipFile(path) as bundle:
             for entry in bundle.infolist():
-                parts[re.split(r"[_.]", Path(entry.filename).name)[0]] += entry.compress_size
+                sizes[re.split(r"[_.]", Path(entry.filename).name)[0]] += entry.compress_size
     else:
-        parts |= {f"{name}, fp32": 4 * value.numel() for name, value in scene.gaussians.items()}
-        parts["head"] = bytes_of_module(scene.head)
-    return {name: size for name, size in parts.items() if size}
+        sizes |= {f"{name}, fp32": 4 * value.numel() for name, value in scene.gaussians.items()}
+        sizes["head"] = bytes_of_module(scene.head)
+    return {name: size for name, size in sizes.items() if size}
 
 
 def box_of(means: Tensor, weights: Tensor, share: float = 0.99) -> list[float]:

@@ -106,8 +106,7 @@ def save(scene: Scene, path: Path | str, *, upright: bool = False, config: PackC
     50
     """
     path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
+    if (suffix := path.suffix.lower()) not in SUFFIXES:
         raise ConfigError(f"{path} has no supported suffix; name it {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
     if upright and suffix not in formats.FORMATS:
         raise ConfigError(f"{suffix} files keep their coordinates; leave out upright")
@@ -133,8 +132,7 @@ def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -
     head = _head_of(state, options, source) if extra.get("head_enabled") else None
     if head is not None:
         gaussians[FEATURES] = state[f"gauss_params.{FEATURES}"].float()
-    interval = options.get("sh_degree_interval")
-    if options.get("warm_start") is None and isinstance(interval, int):
+    if options.get("warm_start") is None and isinstance(interval := options.get("sh_degree_interval"), int):
         degree = int(loaded["step"]) // max(interval, 1)  # training did not reach higher ones
         gaussians["features_rest"] = gaussians["features_rest"][:, : (degree + 1) ** 2 - 1]
     gaussians = formats.usable(gaussians, source).gaussians

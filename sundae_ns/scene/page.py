@@ -180,7 +180,6 @@ def show(scene: Scene, *, height: int = 480, title: str = "Scene") -> Embedded:
     Embedded(title='Scene', height=300)
     """
     height = whole(height, "height")
-    content = page_of(shown_as(title, scene))
-    if len(content) > LARGE:
+    if len(content := page_of(shown_as(title, scene))) > LARGE:
         _log.warning("the notebook holds a page of %.1f MB; prune it, or save it as scene.html", len(content) / 1e6)
     return Embedded(content, title, height)

@@ -315,7 +315,8 @@ def prune_to_bytes(
     counts = [min(n, int((AIM * most - fixed) / each)) for fixed, each in lines]
     if counts[-1] < 1:
         raise ConfigError(f"a file without Gaussians has {lines[-1][0]:,.0f} bytes; ask for more than {most:,}")
-    console, images = Console(stderr=True) if sys.stderr.isatty() else None, list[Tensor]()
+    console = Console(stderr=True) if sys.stderr.isatty() else None
+    images: list[Tensor] = []
     graph = gaussian_graph(scene.gaussians, rule) if rule.uses_graph and n > 1 else None
     middle = max(sorted(counts)[len(counts) // 2], 1) if rule.uses_detail else None
     weights = weights_in(scene, cameras, middle, console, images) if rule.uses_contribution else None
@@ -361,7 +362,8 @@ def _nearest_form(
 ) -> tuple[Form, PrunedScene]:
     """Of less and less exact forms with more and more Gaussians, that whose images are nearest to the scene's."""
     judges = [at_most(camera, PIXELS) for camera in (split(cameras)[1] or list(cameras))[:JUDGES]]
-    truths, as_read = [render(scene, camera).rgb for camera in judges], _as_packed if packs else Form.of
+    truths = [render(scene, camera).rgb for camera in judges]
+    as_read = _as_packed if packs else Form.of
     psnr = -math.inf
     for form, pruned in candidates:
         if (new := measure(as_read(form, pruned.scene), truths, judges).psnr) <= psnr:
@@ -393,7 +395,8 @@ def largest(
     ``at`` makes a file, the smaller, the higher a power within ``powers``; by default of the steps of a pack. The
     search begins at ``power``; about ``per_halving`` more take half of the bytes. ``ConfigError`` if none is found.
     """
-    (low, high), best, before = powers, None, None
+    low, high = powers
+    best, before = None, None
     for _ in range(MOST_FILES):
         made = at(power)
         if (size := bytes_of(made)) <= most:

@@ -186,7 +186,8 @@ def contribution(
     """
     from rich.progress import track  # takes 20 ms, which a render without a prune need not spend
 
-    total, label = source.gaussians["means"].new_zeros(source.gaussians.num_gaussians), "Contribution of Gaussians"
+    total = source.gaussians["means"].new_zeros(source.gaussians.num_gaussians)
+    label = "Contribution of Gaussians"
     largest = source.gaussians["scales"].amax(dim=1).exp()
 
     @torch.no_grad()
@@ -210,8 +211,7 @@ def contribution(
         with torch.enable_grad():
             drawn, splatted = draw(fixed, camera, background.to(total), replace(settings, head=None), depth=False)
             # A prune keeps the same share of the visible Gaussians as of all.
-            cells = count / source.total * float((splatted.radii > 0).sum())
-            detail = pixel_detail(drawn["base_rgb"].detach(), cells)
+            detail = pixel_detail(drawn["base_rgb"].detach(), count / source.total * float((splatted.radii > 0).sum()))
             blended = (splatted.colors[..., 0] * (detail if pixels is None else detail * pixels)).sum()
         image = None if images is None else torch.cat([splatted.colors.detach(), splatted.alpha.detach()], dim=2).half()
         return rows, torch.autograd.grad(blended, colors)[0][:, 0], image

@@ -219,7 +219,8 @@ class Scene:
     @fitting()
     def settings(self, backend: BackendName = "auto", *, head: bool = True) -> RenderSettings:
         """Settings that render the scene with all of its SH degrees; ``BackendError`` without the rasteriser."""
-        rasteriser, enabled = select_backend(backend, self.device), self.head if head else None
+        rasteriser = select_backend(backend, self.device)
+        enabled = self.head if head else None
         return RenderSettings(rasteriser, antialiased=self.antialiased, head=enabled, trained_focal=self.trained_focal)
 
     def __repr__(self) -> str:

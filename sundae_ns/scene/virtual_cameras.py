@@ -216,8 +216,7 @@ def _coarseness(scene: Scene, sizes: Tensor, eyes: Tensor, targets: Tensor, rule
     camera = Camera.from_fov(torch.eye(4), FOV, _PROBE_SIZE, _PROBE_SIZE).to(scene.device)
     inputs = pass_inputs(scene.gaussians, camera, settings)
     for some in chunks(len(eyes), _PROBES):
-        distances = (means - eyes[some, None]).norm(dim=2).clamp_min(1e-9)
-        angles = (sizes - distances.log()).clamp_max(0)
+        angles = (sizes - (means - eyes[some, None]).norm(dim=2).clamp_min(1e-9).log()).clamp_max(0)
         # Blending adds nothing where nothing is seen: the logarithm of one radian.
         powers = torch.stack([angles, angles.square(), torch.ones_like(angles)][: _CHANNELS[rule]], dim=-1)
         probes = dataclasses.replace(inputs, colors=powers)

@@ -50,7 +50,8 @@ def build(
     start.
     """
     check(options)
-    pruning, head, warm = options.pruning, options.head.resolved, options.warm_start is not None
+    pruning, head = options.pruning, options.head.resolved
+    warm = options.warm_start is not None
     strategy = make_strategy(options, num_images)
     params, start = initial_gaussians(options, points, frame)
     gauss_params = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in params.items()})

@@ -105,7 +105,8 @@ def best_head(tried: Sequence[Tried], folds: int) -> str:
         rows = tried[first : first + folds]
         row = replace(rows[0], views=[view for each in rows for view in each.views])
         if best is not None:
-            gain, doublings = HeadGain.of(best, row), math.log2(sum(row.bytes or [1]) / sum(best.bytes or [1]))
+            gain = HeadGain.of(best, row)
+            doublings = math.log2(sum(row.bytes or [1]) / sum(best.bytes or [1]))
             gained = gain.psnr if gain.ssim_db is None else (gain.psnr + gain.ssim_db) / 2
             if not is_enough(gained, min(gain.psnr, gain.ssim), doublings):
                 continue
@@ -203,8 +204,7 @@ def _paired(differences: NDArray[np.float64], pixels: NDArray[np.float64]) -> tu
     if not np.isfinite(differences).all():
         return math.inf, 0.0
     mean, views = float(differences @ pixels), len(differences)
-    squares = float((pixels**2) @ (differences - mean) ** 2)
-    return mean, math.sqrt(squares * views / max(views - 1, 1))
+    return mean, math.sqrt(float((pixels**2) @ (differences - mean) ** 2) * views / max(views - 1, 1))
 
 
 def with_head(curve: Sequence[CurvePoint], gain: HeadGain) -> list[CurvePoint]:
@@ -239,8 +239,7 @@ def choose(curve: Sequence[CurvePoint], tolerance: Tolerance) -> int:
     the count. If PSNR and SSIM ask for different counts, the one that loses least, in tolerances, is taken.
     """
     over = [excess(point, tolerance) for point in curve]
-    good = [index for index, value in enumerate(over) if value <= 1]
-    if not good:
+    if not (good := [index for index, value in enumerate(over) if value <= 1]):
         return curve[over.index(min(over))].count
     index = good[-1]
     if index + 1 == len(curve) or not math.isfinite(over[index + 1]):
@@ -265,10 +264,10 @@ def choose_within(
 
 def affordable(curve: Sequence[CurvePoint], most: int) -> int | None:
     """Largest count whose packed field fits into ``most`` bytes, by the estimates; None if no size is known."""
-    sizes = {math.log(point.count): math.log(point.bytes) for point in curve if point.bytes}
-    if not sizes:
+    if not (sizes := {math.log(point.count): math.log(point.bytes) for point in curve if point.bytes}):
         return None
-    x, y, size = [*sizes], [*sizes.values()], math.log(max(most, 1))
+    x, y = [*sizes], [*sizes.values()]
+    size = math.log(max(most, 1))
     if len(sizes) == 1:
         return max(int(math.exp(x[0] + size - y[0])), 1)
     slope, start = np.polyfit(x, y, 1)

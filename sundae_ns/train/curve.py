@@ -47,8 +47,7 @@ def read_count_curve(folder: Path) -> CountCurve | None:
     """
     path = folder / RECORD
     try:
-        record = json.loads(regular(path).read_text(encoding="utf-8")).get("count")
-        if record is None:
+        if (record := json.loads(regular(path).read_text(encoding="utf-8")).get("count")) is None:
             return None
         points = [{entry.name: point[entry.name] for entry in fields(CurvePoint)} for point in record["curve"]]
         # Infinite losses are stored as null, and unknown bytes too.

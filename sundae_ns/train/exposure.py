@@ -90,8 +90,7 @@ class ExposureCompensation(Callback):
 
     def balanced(self, photo: Tensor, batch: Mapping[str, Any]) -> Tensor:
         """A training photo ``[H, W, 3]``, once gains are in use divided by its own; not one with an alpha channel."""
-        index = _index(batch)
-        if index is None or not self._divides:
+        if (index := _index(batch)) is None or not self._divides:
             return photo
         self._gains = self._gains.to(photo.device)
         return photo / self._gains[index]
@@ -102,8 +101,7 @@ class ExposureCompensation(Callback):
 
         A mask ``[H, W, 1]`` has the pixels that count; None for all.
         """
-        index = _index(batch)
-        if index is None or self._smoother is None or self._state.step % MEASURED_EVERY:
+        if (index := _index(batch)) is None or self._smoother is None or self._state.step % MEASURED_EVERY:
             return
         self._sums, self._gains = self._sums.to(photo.device), self._gains.to(photo.device)
         apart = max(int((photo.shape[0] * photo.shape[1] / SAMPLE) ** 0.5), 1)

@@ -186,8 +186,7 @@ class StepRecordings:
 
     def _kernel_by_kernel(self, work: StepWork, inputs: StepInputs, settings: RenderSettings) -> StepResult:
         """Run a step on the stream of the recordings, and count its pairs, which waits for the GPU."""
-        device = inputs.target.device
-        if device.type != "cuda":
+        if (device := inputs.target.device).type != "cuda":
             return work(inputs, settings, None)
         capacity = Capacity()
         with warm_up(device):
@@ -208,9 +207,9 @@ class StepRecordings:
         """The recording of a kind of steps; None if it has to run kernel by kernel."""
         if not self._record or self._most_on_host is None:
             return None
-        key, most = (kind, addresses), int(self._most_on_host)
-        recording = self._recordings.get(key)
-        if recording is None and len(self._recordings) >= MAX_RECORDINGS:
+        key = kind, addresses
+        most = int(self._most_on_host)
+        if (recording := self._recordings.get(key)) is None and len(self._recordings) >= MAX_RECORDINGS:
             oldest = next(iter(self._recordings))
             if self._steps - self._used[oldest] < UNUSED:
                 return None
@@ -270,8 +269,7 @@ class RecordedStep:
         Afterwards the tensors of ``state`` are rows of this object's buffers, and ``info`` says that the statistics of
         densification are counted. Learning rates are those of the optimizers; the backend of ``settings`` is gsplat.
         """
-        held = self._held
-        if held is None or not held.unchanged(state, settings):
+        if (held := self._held) is None or not held.unchanged(state, settings):
             held = self._held = self._hold(state, settings)
         values = [*(float(group["lr"]) for _, _, group in held.groups), float(state.gaussians.num_gaussians)]
         # Pinned: copying from other memory would wait until the GPU has finished the last step.
@@ -342,8 +340,7 @@ class RecordedStep:
             updates = []
             for value in group["params"]:
                 buffer, moments = tensors.get(name, value), optimizer.state[value]
-                grad = grads.get(buffer)
-                if grad is None:
+                if (grad := grads.get(buffer)) is None:
                     continue
                 if grad.stride() != buffer.stride():  # kernels walk through all tensors in the order of memory
                     grad = torch.empty_like(buffer).copy_(grad)

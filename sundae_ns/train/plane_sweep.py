@@ -74,8 +74,7 @@ class Sweep:
     def add(self, index: int) -> Tensor:
         """Find the depths of a view ``[H, W]``, along its axis; 0 where there are none."""
         photo, others = self.photos[index], [self.photos[i] for i in self._neighbors[index][0]]
-        limits = self._limits(photo.camera)
-        if limits is None or not others:
+        if (limits := self._limits(photo.camera)) is None or not others:
             return self._depths[index]
         low, high = limits
         best = torch.full_like(self._depths[index], -1.0)
@@ -87,8 +86,7 @@ class Sweep:
         # Normals of planes in camera coordinates, away from it: those that face it or nearly, and the ground's.
         for normal in [*photo.camera.K.new_tensor(_TURNED), photo.camera.viewmat[:3, :3] @ -normalize(self._up, dim=0)]:
             facing = rays @ normal  # of a plane normal . X = 1 / s a pixel has the inverse depth facing * s
-            steep = facing > STEEPEST * lengths
-            if not steep.any():
+            if not (steep := facing > STEEPEST * lengths).any():
                 continue
             ends = 1 / (high * float(facing[steep].max())), 1 / (low * float(facing[steep].min()))
             planes = _number_of_planes(photo, others, normal, ends)

@@ -237,7 +237,8 @@ class ScheduledPruning(Callback):
 
     def after_step(self, run: TrainingRun) -> None:
         """Prune if it is due, evaluate, report, and restart the learning rates; saves before a ``SundaeError``."""
-        state, config, due = run.state, self.config, self.needs_all(run)
+        state, config = run.state, self.config
+        due = self.needs_all(run)
         # Densification has the most Gaussians after growing, before it culls.
         state.pruning["peak"] = max(state.pruning["peak"], state.densification.get("peak", 0))
         if due:
@@ -339,8 +340,7 @@ class FloaterRemoval(Callback):
     def after_step(self, run: TrainingRun) -> None:
         """Remove floaters once."""
         state = run.state
-        points = self._points
-        if points is None or not self.needs_all(run):
+        if (points := self._points) is None or not self.needs_all(run):
             return
         self._points = None
         eyes = torch.stack([camera.center for camera, _ in run.training_views()])

@@ -177,10 +177,8 @@ def set_schedule(config: Any, usual: Any, words: Iterable[str]) -> None:
     """
     usual = deepcopy(usual)  # config may share parts with it
     given = given_options(words)
-    saved = config.load_dir or config.load_checkpoint
-    if saved is not None:
-        run = _resumed_run(config, saved)
-        if run is not None and usual is not None:
+    if (saved := config.load_dir or config.load_checkpoint) is not None:
+        if (run := _resumed_run(config, saved)) is not None and usual is not None:
             for line in take_options(config, run, usual, given):
                 _log.warning(line + ("; a prune that is done is not repeated" if ".pruning." in line else ""))
             config.schedule_length = config.schedule_length or run.schedule_length or run.max_num_iterations

@@ -63,8 +63,7 @@ class StepLosses:
         losses = {"main_loss": main_loss}
         if base_loss is not None:
             losses["base_loss"] = options.base_loss_weight * base_loss
-        weight = self.prior_weight(state)
-        if weight > 0:
+        if (weight := self.prior_weight(state)) > 0:
             # Unused Gaussians become transparent and small (equation 10 of 3DGS-MCMC). In a pruned field they would
             # fit what differs between the training images.
             for name, values in (("opacity", params["opacities"].sigmoid()), ("scale", params["scales"].exp())):

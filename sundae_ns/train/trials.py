@@ -167,7 +167,8 @@ class Trials(Callback):
     name = "trials"
 
     def __init__(self, options: Any, state: TrainingState, densification: Densification, begins_at: float) -> None:
-        self.config, self.ssim_weight, self.begins_at = options.pruning, options.ssim_lambda, begins_at
+        self.config, self.ssim_weight = options.pruning, options.ssim_lambda
+        self.begins_at = begins_at
         self.decides_head = options.head.mode == "auto"
         self.progress = Progress()
         self.trial: Trial | None = None  # The current trial
@@ -213,12 +214,15 @@ class Trials(Callback):
         """Counterpart of :meth:`state_dict`; ``CheckpointError`` if Gaussians to go back to are missing."""
         if not saved:
             return
-        engine, tried = saved["engine"], [Tried(**row) for row in saved["progress"]["tried"]]
+        engine = saved["engine"]
+        tried = [Tried(**row) for row in saved["progress"]["tried"]]
         self.progress = progress = Progress(**{**saved["progress"], "tried": tried})
         if self.decides_head:
             self.enable_head(state, progress.chosen.get("head", "plain") != "plain")
         self.trial = None if engine["trial"] is None else Trial(**engine["trial"])
-        self.kept, self.taken_back, self.coming = dict(engine["kept"]), engine["taken_back"], dict(engine["coming"])
+        self.kept = dict(engine["kept"])
+        self.taken_back = engine["taken_back"]
+        self.coming = dict(engine["coming"])
         self._mean = RunningMean.of(engine, state.device)
         self._apply(state)
         needed = ["start"] if progress.stage in ("count", "tenth", "head", "length") else []
@@ -233,8 +237,10 @@ class Trials(Callback):
 
     def before_training(self, run: TrainingRun) -> None:
         """Hold views out; decide at once where trials cannot."""
-        progress, state, indices = self.progress, run.state, run.view_indices()
-        num_views, several = len(indices), run.images_per_step > 1
+        progress, state = self.progress, run.state
+        indices = run.view_indices()
+        num_views = len(indices)
+        several = run.images_per_step > 1
         max_bytes = self.config.max_bytes or math.inf
         # A warm start skips the steps before the prune.
         progress.steps = progress.steps or (run.schedule_length or 0) + state.offset
@@ -366,7 +372,9 @@ class Trials(Callback):
 
     def end(self, run: TrainingRun, stage: str) -> None:
         """End the trials of a stage: forget the kept copies, and serve its views from the next step on."""
-        self.trial, self.kept, self._mean = None, {}, RunningMean()
+        self.trial = None
+        self.kept = {}
+        self._mean = RunningMean()
         self.coming.pop(stage, None)
         self.hold_out(run)
         self._apply(run.state)
@@ -556,7 +564,8 @@ class Trials(Callback):
         progress, state = self.progress, run.state
         if reason:
             _log.info(f"the head is {'removed' if head == 'plain' else 'enabled'}: {reason}")
-        progress.stage, progress.chosen["head"], progress.reason = "", head, reason
+        progress.chosen["head"] = head
+        progress.stage, progress.reason = "", reason
         self.end(run, "head")
         self.enable_head(state, head != "plain")
         if head == "plain":
@@ -581,7 +590,8 @@ class Trials(Callback):
 
     def _try_length(self, run: TrainingRun) -> None:
         """Train another window; or go back, to train on all views for as many steps as were best."""
-        progress, state, views = self.progress, run.state, self._folds[-1]
+        progress, state = self.progress, run.state
+        views = self._folds[-1]
         measured = []
         for row in progress.of("length"):
             psnr, ssim = mean_quality(row.qualities)
@@ -640,7 +650,8 @@ def _figures(tried: list[Tried]) -> dict[str, dict[str, Any]]:
     for head in dict.fromkeys(row.head for row in tried):
         rows = [row for row in tried if row.head == head]
         views = [view for row in rows for view in row.qualities]
-        (psnr, ssim), size = mean_quality(views), sum(rows[0].bytes) if rows[0].bytes else None
+        psnr, ssim = mean_quality(views)
+        size = sum(rows[0].bytes) if rows[0].bytes else None
         figures[head] = {"psnr": psnr, "ssim": ssim, "bytes": size, "views": [view._asdict() for view in views]}
     return figures
 

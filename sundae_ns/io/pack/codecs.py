@@ -130,7 +130,7 @@ def quats_at(levels: Tensor, step: float) -> Tensor:
     square = x * x + y * y + z * z
     w = (1 - square).clamp_min(0).sqrt()
     length = (w * w + square).sqrt()
-    return torch.stack([part / length for part in (w, x, y, z)], dim=1)
+    return torch.stack([value / length for value in (w, x, y, z)], dim=1)
 
 
 def rotation_bound(step: float) -> float:
@@ -151,7 +151,7 @@ def _normalized(quats: Tensor) -> Tensor:
     w, x, y, z = (quats / torch.where(scale > 0, scale, 1.0)).T
     w = torch.where(scale[:, 0] > 0, w, 1.0)
     length = (w * w + x * x + y * y + z * z).sqrt() * torch.where(w < 0, -1.0, 1.0)
-    return torch.stack([part / length for part in (w, x, y, z)], dim=1)
+    return torch.stack([value / length for value in (w, x, y, z)], dim=1)
 
 
 @dataclass(frozen=True, eq=False)
