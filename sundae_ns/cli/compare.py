@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import shlex
 import sys
+from contextlib import redirect_stderr
 from dataclasses import replace
 from functools import partial
+from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
@@ -81,7 +83,7 @@ def compare(
     measured_by = partial(measure, lpips=lpips, repeats=repeats, command=command)
     with progress_bar() as progress, TemporaryDirectory() as folder:
         if formats:
-            source = open_run(scenes[0], max_cameras=100, data=data) if is_run(scenes[0]) else load(scenes[0])
+            source = open_run(scenes[0], max_cameras=100, data=data) if is_run(scenes[0]) else first or load(scenes[0])
             suffixes = (suffix for suffix in (*FORMATS, ".sundae") if suffix != scenes[0].suffix.lower())
             scenes += [Path(folder, scenes[0].stem + suffix) for suffix in suffixes]
         opened = against_photos(data)
@@ -92,7 +94,9 @@ def compare(
             task = progress.add_task(f"Opening {escape(label)}", total=None)
             try:
                 if formats and path != scenes[0]:
-                    save(source, path)
+                    with redirect_stderr(StringIO()) as said:
+                        save(source, path)
+                    print(said.getvalue().replace(str(path), f"{scenes[0]} as {path.suffix}"), end="", file=sys.stderr)
                 subject = opened(path)
                 progress.update(task, description=f"Measuring {escape(label)}", total=len(subject.truths))
                 measured = measured_by(subject, label=label, progress=partial(progress.advance, task))

@@ -31,10 +31,7 @@ Int = Annotated[int | None, _optional(int, "INT"), NO_DEFAULT]
 Float = Annotated[float | None, _optional(float, "FLOAT"), NO_DEFAULT]
 File = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 Input = Annotated[Path, tyro.conf.Positional]  # the file or the folder that a command reads
-_SCENES = (
-    "a packed scene or its page (.html), a run (its folder or config.yml), or a .ply, .spz, .sog, lod-meta.json, .glb, "
-    ".splat, .ksplat or gsplat's .pt."
-)
+_SCENES = "a packed scene or page, a run's folder, or a .ply, .spz, .sog, lod-meta.json, .glb, .splat, .ksplat or .pt."
 Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(help=_SCENES)]
 Rest = Annotated[tuple[str, ...], tyro.conf.Positional, NO_DEFAULT, tyro.conf.arg(metavar="[-- OPTION ...]")]
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]

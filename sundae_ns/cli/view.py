@@ -37,8 +37,7 @@ def serve(page: str, port: int) -> ThreadingHTTPServer:
             named = [name.strip().lower() for name in self.headers.get_all("Host", [])]
             status, body = (200, content) if self.path == "/" else (404, b"")
             if len(named) != 1 or named[0] not in _hosts(port):
-                advice = f"Open http://127.0.0.1:{port}/; forward it from a port of the same number."
-                status, body = 421, advice.encode()
+                status, body = 421, b"Open http://127.0.0.1:%d/; forward it from a port of the same number." % port
             self.send_response(status)
             self.send_header("Content-Type", "text/html; charset=utf-8")
             self.send_header("Content-Length", str(len(body)))

@@ -23,9 +23,9 @@ SUNDAE = Path(sys.executable).parent / "sundae"
     ("words", "code", "says"),
     [
         ([], 2, "show a scene with its head in the browser"),
-        (["help"], 0, "show a scene with its head in the browser"),
         (["--help"], 0, "sundae COMMAND --help shows"),
         (["help", "view"], 0, "usage: sundae view "),
+        (["help", "export"], 0, " Below the full scene are "),
         (["--version"], 0, f"sundae_ns {sn.__version__}\n"),
     ],
 )
