@@ -45,8 +45,7 @@ def render(
     check_file(out, reads=[scene, advanced.cameras], overwrite=advanced.overwrite)
     edit = opened(scene, wishes, advanced, most=MOST_CAMERAS)
     views = list(edit.scene.cameras)
-    speed = edit.speed
-    if (seconds is not None and (speed is not None or not video)) or (video and view is not None):
+    if (seconds is not None and (edit.speed is not None or not video)) or (video and view is not None):
         raise ConfigError("--seconds is the length of a film without a camera path, --view of an image; leave it out")
     if not video and view is None and (advanced.start_view is not None or advanced.cameras is None):
         views = [edit.scene.start] if edit.scene.start else views
@@ -54,14 +53,14 @@ def render(
         several = f"there are {len(views)} cameras; give --view 0 to {len(views) - 1}, or write an .mp4"
         raise ConfigError(several if len(views) > 1 else "there is one camera; leave out --view")
     left = edit.reduced(Path("scene.sundae")).stated.to(fastest_device())
-    if video and speed is None:
+    if video and edit.speed is None:
         with Console(stderr=True).status("Finding a path"):
             views = film_views(left, seconds=12.0 if seconds is None else seconds, frames_per_second=fps or 24)
     views = views or list(filter(None, [opening(left).start]))
     views = [camera if width is None else camera.zoomed(width / camera.width) for camera in views]
     if video:  # whose colours have half the size
         views = [camera._replace(width=camera.width // 2 * 2, height=camera.height // 2 * 2) for camera in views]
-        speed = fps or speed or 24
+        speed = fps or edit.speed or 24
         with replacing(out) as partial, progress_bar() as bar:
             images = (image_of(render_view(left, camera).rgb) for camera in bar.track(views, description="Rendering"))
             count = write_video(partial, images, frames_per_second=speed)

@@ -81,6 +81,8 @@ class Project:
         if not self.posed and ((self.photos / "sparse").is_dir() or is_model(self.photos)):
             raise no_transforms(self.photos)  # says how to use a capture in another layout
         self.train.check(self.photos)
+        if self.posed and self.poses.masks is not None:
+            self.train.words(self.photos, self.out, masks=self.poses.masks)  # refuses wrong ones
         if self.quality == "draft" and (self.train.steps is not None or method == "sundae-tiny"):
             raise ConfigError(f"a draft has {DRAFT_STEPS:,} steps, and sundae-tiny fewer; leave out --quality")
         if self.quality == "best" and (self.train.keep, self.train.count, method) != (None, None, "sundae"):

@@ -65,12 +65,11 @@ class TrainOptions(Wishes):
         if tunes and not any(_value_of(option, more) for option in LENGTHS):
             given["--finetune-steps"] = FINETUNE_STEPS
         words += [text for option, value in given.items() if value is not None for text in (option, str(value))]
-        layout = None if any(map(_is_parser, more)) else posed_layout(capture)
-        of_masks = [] if masks is None else ["--masks-path", word(masks.resolve())]
-        if of_masks and (layout is None or layout.words[0] != "colmap"):
+        layout = None if any(map(_is_parser, more)) else posed_layout(capture, masks)
+        if masks is not None and (layout is None or layout.words[0] != "colmap"):
             raise ConfigError(f"{capture} is not in COLMAP's layout; give frames their mask_path in transforms.json")
         # The parser and its options come last.
-        return [*words, *more] if layout is None else [*words, *layout.options, *more, *layout.words, *of_masks]
+        return [*words, *more] if layout is None else [*words, *layout.options, *more, *layout.words]
 
     @property
     def pack_words(self) -> list[str]:
@@ -96,8 +95,7 @@ def train(
         further: behind --, any options of ns-train, as in sundae train CAPTURE -- --pipeline.model.sh-degree 2
         out: folder of runs.
         resume: train the remaining steps of the newest unfinished run of this method on this capture.
-        masks: folder with a mask for each photo, under its name, of a capture in COLMAP's layout; training leaves out
-            what is black.
+        masks: folder with a mask for each photo of a COLMAP capture, under its name; training leaves out what is black.
     """
     if further and not (further[0].startswith("-") or _is_parser(further[0])):
         raise ConfigError(f"{further[0]} is no option; options of ns-train follow a --")

@@ -53,16 +53,16 @@ def models_in(data: Path) -> dict[str, int]:
     return dict(sorted(counts.items(), key=lambda item: -item[1]))
 
 
-def posed_layout(data: Path) -> Layout | None:
-    """The largest COLMAP model of a capture, or else its files of Blender; None if it has a ``transforms.json``."""
+def posed_layout(data: Path, masks: Path | None = None) -> Layout | None:
+    """The largest COLMAP model of a capture, with ``masks``, or else Blender's files; None for ``transforms.json``."""
     if (data / "transforms.json").is_file():
         return None
     if models := models_in(data):
-        return _colmap_layout(data, next(iter(models)), len(models))
+        return _colmap_layout(data, next(iter(models)), len(models), masks)
     return _blender_layout(data) if (data / _BLENDER).is_file() else None
 
 
-def _colmap_layout(data: Path, model: str, num_models: int) -> Layout:
+def _colmap_layout(data: Path, model: str, num_models: int = 1, masks: Path | None = None) -> Layout:
     names = [image.name for image in read_images(data / model).values()]
     # Undistorted images lie beside their model.
     above = [data / model, *(folder for folder in (data / model).parents if folder.is_relative_to(data))]
@@ -75,11 +75,16 @@ def _colmap_layout(data: Path, model: str, num_models: int) -> Layout:
     while longest / downscale > LONGEST_SIDE and (Path(f"{images}_{2 * downscale}") / names[0]).is_file():
         downscale *= 2
     folder = images.relative_to(data).as_posix()
-    path = [] if folder == "images" else ["--images-path", folder]
+    more = [] if folder == "images" else ["--images-path", folder]
     several = f", the largest of {num_models} models" if num_models > 1 else ""
     smaller = f", at 1/{downscale} of their size" if downscale > 1 else ""
     description = f"COLMAP layout: {len(names):,} images in {folder}{smaller}, poses of {model}{several}"
-    return Layout(description, ["colmap", "--colmap-path", model, *path, "--downscale-factor", str(downscale)])
+    if masks is not None:
+        used = masks if downscale == 1 else Path(f"{masks}_{downscale}")
+        if lost := [mask for name in names if not (mask := (used / name).with_suffix(".png")).is_file()]:
+            raise DataError(f"{lost[0]}, a mask, is missing; check --masks, or add it, black where to ignore pixels")
+        more += ["--masks-path", str(masks.resolve())]
+    return Layout(description, ["colmap", "--colmap-path", model, *more, "--downscale-factor", str(downscale)])
 
 
 def _blender_layout(data: Path) -> Layout:
@@ -120,18 +125,16 @@ def no_transforms(data: Path) -> DataError:
 
 def no_model(data: Path, model: Path) -> DataError:
     """The error for a ``--colmap-path`` that is no folder, with the models that a capture has."""
-    models = models_in(data)
-    advice = f"give {_words(data, models)}" if models else "give the folder of the model (usually sparse/0)"
+    advice = f"give {_words(data, models)}" if (models := models_in(data)) else "give the model's (usually sparse/0)"
     return DataError(f"{data / model} is not a folder; {advice} as colmap --colmap-path")
 
 
 def _words(data: Path, models: dict[str, int]) -> str:
     """The words of ``ns-train`` that read the largest of some models, in backquotes."""
     largest, count = next(iter(models.items()))
-    try:
-        words = _colmap_layout(data, largest, 1).words
-    except DataError:  # the images are elsewhere, or the model is damaged; ns-train then says so
-        words = ["colmap", "--colmap-path", largest]
+    words = ["colmap", "--colmap-path", largest]
+    with suppress(DataError):  # the images are elsewhere, or the model is damaged; ns-train then says so
+        words = _colmap_layout(data, largest).words
     several = f" (the largest of {len(models)} models, with {count:,} images)" if len(models) > 1 else ""
     return f"`{shlex.join(words)}`{several}"
 
@@ -142,8 +145,7 @@ def larger_model(data: Path, model: Path) -> str | None:
     largest, count = next(iter(models), ""), models.get(model.as_posix())
     if count is None or models[largest] <= count:
         return None
-    more = f"{largest} has {models[largest]:,}; to train on those, give --colmap-path {largest}"
-    return f"{model} has {count:,} images and {more}"
+    return f"{model} has {count:,} images and {largest} has {models[largest]:,}; for those give --colmap-path {largest}"
 
 
 def unused_masks(folder: Path) -> str | None:

@@ -37,7 +37,6 @@ REFUSALS = {
     "prune in.ply -o a.ply --max-mb inf": "max-mb is inf; give less, at least 0.001",
     "prune in.ply -o a.ply --num-cameras 10001": "n is 10001; give at most 10,000",
     "prune in.ply -o a.ply --seed 99999999999999999999": "seed is 99999999999999999999; give at most 9,223,372,",
-    "prune in.ply -o a.ply --count 0": "count is 0; give at least 1",
     "prune empty.ply -o a.ply": "empty.ply has 0 Gaussians, and none is finite; export it again",
     "prune in.ply -o /proc/a.ply": "cannot write to /proc (",
     "prune a.ksplat -o a.ply": "a.ksplat is not a complete .ksplat (",
@@ -52,7 +51,6 @@ REFUSALS = {
     "export in.ply -o a.ply": "in.ply is a .ply already; name another suffix, or what to change",
     "export in.ply -o a.sog --lod": "name one without a suffix, and leave out --max-mb",
     "export in.ply in.ply -o a.ply": "or a start view; name it .html; sn.merge joins two",
-    "export in.ply -o a --lod --start-view 0": "only a page shows two scenes, views or a start view",
     "export in.ply -o a.sog --upright": "not in nerfstudio's coordinates",
     "export in.sundae -o a.html --upright": "leave out --upright",
     "export in.bin -o a.ply": "in.bin is not a complete .spz (",
@@ -62,13 +60,11 @@ REFUSALS = {
     "pack in.ply -o a.sundae --finetune 9": "in.ply is a .ply file without photos; leave out",
     "pack in.ply -o a.sundae --start-view 0": "there is no camera 0 in the scene; give a camera file",
     "pack in.ply -o a.sundae --target-drop 1": "leave out --target-drop, or give a run",
-    "pack in.ply -o a.sundae --target-drop 1 --remove-floaters": "leave out --remove-floaters",
     "prune gone -o a.ply --remove-floaters 1.5": "remove-floaters is 1.5; give 0 (careful) to 1",
     "pack in.ply -o a.sundae --finetune 5 --crop 0 0 0 1 1 1": "leave out --crop",
     "pack in.ply -o a.spz": "a.spz is a name of another format; name it .sundae, or write it with sundae export",
     "pack gone -o a.sundae": "gone does not exist",
     "pack gone -o a.sundae --finetune -1": "finetune is -1",
-    "pack gone -o a.sundae --max-cameras -1": "max-cameras is -1",
     "pack gone -o a.sundae --target-drop nan": "target-drop is nan",
     "pack gone -o a.sundae --target-drop 1 --max-mb 9": "exclude each other",
     "compare a.lcc in.ply -o out": "a.lcc is a scene of XGRIDS; convert it to .ply with",
@@ -84,17 +80,14 @@ REFUSALS = {
     "view a.splat": "a.splat is not a complete .splat (",
     "render a.pth -o a.png": "a.pth is a checkpoint of another trainer; give its .ply",
     "render in.sundae -o a.png": "there are 2 cameras; give --view 0 to 1, or write an .mp4",
-    "render in.sundae -o a.png --view 2": "there are 2 cameras; give --view 0 to 1",
     "render in.sundae -o a.png --view -1": "there are 2 cameras; give --view 0 to 1",
     "render in.sundae -o a.gif --view 0": "a.gif has no supported suffix; name it .png",
     "render in.sundae -o a.png --view 0 --width 1": "width is 1; give at least 2",
     "render in.sundae -o a.png --view 0 --fps 9": "--fps is of a video",
-    "render in.sundae -o a.png --view 0 --seconds 9": "--seconds is the length of a film",
     "render in.sundae -o a.mp4 --view 0": "--view of an image; leave it out",
     "render in.sundae -o a.mp4 --fps nan": "--fps is of a video",
     "render in.sundae -o a.png --cameras damaged.json": "damaged.json is not JSON",
     "render in.sundae -o a.png --cameras none.json": "none.json",
-    "render nothing -o a.png": "nothing does not exist",
     "render in.sundae -o damaged.json/new/a.png": "damaged.json is no folder; choose another",
     "train scene --keep 0": "keep is 0.0",
     "train scene --steps 0": "steps is 0",
@@ -111,15 +104,12 @@ REFUSALS = {
     "poses text.mp4 -o out": "text.mp4 is not a video that",
     "poses photos/0.JPG -o out": "sundae prune takes scenes",
     "poses photos -o used": "used holds files; choose another folder",
-    "poses photos -o text.mp4": "text.mp4 is a file; choose another folder",
     "poses photos -o photos/capture": "photos/capture lies in photos",
     "poses photos -o out --frames 2": "frames is 2; give at least 3",
     "poses photos -o out --masks gone": "photos/0.JPG has no mask 0.png in gone; add it",
-    "poses photos -o out --masks empty": "photos/0.JPG has no mask 0.png in empty",
     "poses walk.mp4 -o out --masks empty": "a video has no masks",
     "run gone -o out": "gone does not exist; check the path",
     "run empty -o out": "holds no photos",
-    "run photos -o out --frames 2": "frames is 2; give at least 3",
     "run model -o out": "cameras.bin is not a complete cameras.bin of COLMAP",
     "run model/sparse/0 -o out": "is a COLMAP model without its images",
     "run undistorted -o out": "undistorted has no image 0.png, which its model dense/sparse states",
@@ -127,15 +117,15 @@ REFUSALS = {
     "run photos -o photos/out": "lies in photos",
     "run photos -o .": "holds what the command reads",
     "run photos -o used": "used holds files; choose another folder",
-    "run photos -o out --keep 2": "keep is 2.0",
-    "run photos -o out --steps 0": "steps is 0",
     "compare in.ply in.sundae --formats": "one scene with itself; leave out in.sundae",
     "export in.ply -o levels --lod --max-mb 1": "leave out --max-mb",
     "view in.ply --count 0": "count is 0; give at least 1",
-    "render in.sundae -o a.png --keep 2": "keep is 2.0",
     "run photos -o out --quality best --method sundae-fast": "--quality best needs a method that",
     "run photos -o out --quality draft --steps 9": "a draft has 3,000 steps",
     "run photos -o out --masks gone": "photos/0.JPG has no mask 0.png in gone; add it",
+    "run posed -o out --masks gone": "gone/0.png, a mask, is missing; check --masks, or add it",
+    "run scene -o out --masks gone": "scene is not in COLMAP's layout; give frames their mask_path",
+    "train posed --masks photos": "photos/0.png, a mask, is missing",
 }
 
 
@@ -160,12 +150,13 @@ def inputs(tmp_path_factory):
     for name, content in {**contents, **dict.fromkeys(empty, b"")}.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(content)
-    for name in ("empty", "photos"):
-        (folder / name).mkdir()
+    (folder / "empty").mkdir()
     for index in range(PHOTOS):
         photo(folder / f"photos/{index}.JPG")
     write_video(folder / "walk.mp4", 9)
     write_model(folder / "undistorted/dense/sparse", ["0.png"], (20, 16))
+    write_model(folder / "posed/sparse", ["0.JPG"], (20, 16))
+    photo(folder / "posed/images/0.JPG")
     return folder
 
 

@@ -40,6 +40,7 @@ def test_a_model_and_its_images(tmp_path, place, images, words):
     assert is_posed(data)
     layout = posed_layout(data)
     assert layout.words == ["colmap", "--colmap-path", *words, "--downscale-factor", "1"]
+    assert posed_layout(data, data / images).words[-4:-2] == ["--masks-path", str((data / images).resolve())]
     assert shlex.split(str(no_transforms(data)).split("`")[1]) == layout.words, "the advice is what sundae train adds"
 
 
@@ -49,6 +50,7 @@ def test_smaller_images_are_taken_where_there_are_some(tmp_path, made, factor):
     for one in made:
         photos(tmp_path / f"images_{one}", 3, (6000 // one, 40 // one))
     assert posed_layout(tmp_path).words[-1] == str(factor)
+    refused(lambda data: posed_layout(data, data / "masks"), tmp_path, f"masks_{factor}/0.png".replace("_1/", "/"))
     (tmp_path / "transforms.json").write_text("{}")
     assert is_posed(tmp_path)
     assert posed_layout(tmp_path) is None, "a transforms.json comes first"
@@ -122,7 +124,7 @@ def test_a_larger_model_is_named(tmp_path):
     (tmp_path / "sparse" / "10" / "images.bin").write_bytes(b"\0")
     assert layouts.models_in(tmp_path) == {"sparse/0": 3, "sparse/1": 20, "sparse/10": 0}
     remark = layouts.larger_model(tmp_path, Path("sparse/0"))
-    assert remark == "sparse/0 has 3 images and sparse/1 has 20; to train on those, give --colmap-path sparse/1"
+    assert remark == "sparse/0 has 3 images and sparse/1 has 20; for those give --colmap-path sparse/1"
     assert layouts.larger_model(tmp_path, Path("sparse/1")) is None
     assert layouts.larger_model(tmp_path, Path("elsewhere")) is None
     assert "give `colmap --colmap-path sparse/1`" in str(no_model(tmp_path, Path("colmap/sparse/0")))

@@ -335,7 +335,7 @@ def test_a_larger_model_beside_the_given_one(capture, load, capsys):
     load(capture, colmap="sparse/0")
     assert f"sparse/0 has 4 images and sparse/1 has {len(names)}" in said(capsys)
     load(capture, colmap="sparse/1")
-    assert "to train on those" not in said(capsys)
+    assert "for those" not in said(capsys)
 
 
 def test_a_missing_image_is_named_with_the_one_beside_it(capture, load, edit):
