@@ -52,8 +52,7 @@ def write_preview(path: Path, before: Scene, after: Scene, cameras: Sequence[Cam
 
 def bytes_at(path: Path) -> int | None:
     """Bytes of the files or the folder of a scene; None for a run, which holds more than that."""
-    kind = kind_of_gaussians(path)
-    if kind is None and kind_of(path) is None and find_config(path) is not None:
+    if (kind := kind_of_gaussians(path)) is None and kind_of(path) is None and find_config(path) is not None:
         return None
     folder = path.parent if path.name in METAS else path
     files = rank_files(path) if kind == "gsplat" else {path, *folder.rglob("*")}

@@ -96,10 +96,8 @@ def stated_start(scene: Scene) -> dict[str, Any]:
 def start_of(stated: Mapping[str, Any]) -> tuple[Direction | None, Camera | None]:
     """Up axis and start view of JSON values; None for one that is missing, or that the schema refuses."""
     valid = [name for name in ("up", "start") if name in stated and fault(stated[name], _PROPERTIES[name]) is None]
-    camera = None
-    if "start" in valid:
-        start = stated["start"]
-        camera = Camera.from_pose(torch.tensor(start["pose"], dtype=torch.float64), start["intrinsics"], *start["size"])
+    start = stated["start"] if "start" in valid else None
+    camera = start and Camera.from_pose(start["pose"], start["intrinsics"], *start["size"])
     return unit(stated["up"]) if "up" in valid else None, camera
 
 

@@ -54,9 +54,8 @@ def page(scenes: Scene | Mapping[str, Scene], path: Path | str, *, views: Mappin
     >>> path = pathlib.Path(tempfile.mkdtemp(), "both.html")
     >>> sn.page({"before": scene, "after": scene[:25]}, path, views={"Front": 0})
     """
-    path = Path(path)
-    named = {path.resolve().stem: scenes} if isinstance(scenes, Scene) else dict(scenes)
-    write_page(path, *(shown_as(name, scene) for name, scene in named.items()), views=views)
+    named = {Path(path).resolve().stem: scenes} if isinstance(scenes, Scene) else dict(scenes)
+    write_page(Path(path), *(shown_as(name, scene) for name, scene in named.items()), views=views)
 
 
 def shown_as(name: str, scene: Scene, config: PackConfig | None = None) -> Shown:

@@ -153,8 +153,7 @@ def weights_in(
     source, settings = GaussianSource(sized.gaussians), scene.settings(head=False)
     weights = contribution(source, views, scene.background, settings, count, images=images, console=console)
     if not bool((weights > 0).any()):
-        none = f"{len(scaled)} views see none of {scene.num_gaussians:,} Gaussians"
-        raise DataError(f"{none}; give cameras that look at the scene, or export it again")
+        raise DataError(f"{len(scaled)} views see none of {len(scene):,} Gaussians; give others, or export it again")
     return weights
 
 
@@ -312,7 +311,15 @@ def prune_to_bytes(
         if len(left[2]) < LEAST * most:
             print(f"the whole scene takes {len(left[2]) / MEGABYTE:.2f} MB, less than was asked for", file=sys.stderr)
         return left
-    counts = [min(n, int((AIM * most - fixed) / each)) for fixed, each in lines]
+    bare = lines[-1]
+    if scene.head is not None:
+        bare = _bytes_by_count(dataclasses.replace(scene, head=None), partial(bytes_of, form=forms[-1]))
+    *counts, more = (min(n, int((AIM * most - fixed) / each)) for fixed, each in (*lines, bare))
+    if 4 * (head := lines[-1][0] - bare[0]) > most - bare[0] and more > max(counts[-1], 0):
+        said = f"the head takes {head:,.0f} of {most:,} bytes; with --no-head about {more:,} Gaussians fit in place of"
+        if counts[-1] < 1:
+            raise ConfigError(f"{said} none")
+        print(f"{said} {counts[-1]:,}", file=sys.stderr)
     if counts[-1] < 1:
         raise ConfigError(f"a file without Gaussians has {lines[-1][0]:,.0f} bytes; ask for more than {most:,}")
     console = Console(stderr=True) if sys.stderr.isatty() else None
