@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import unicodedata
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -81,7 +80,7 @@ def check_transforms(path: Path, *, splits: Sequence[str] = ()) -> dict[str, Any
         raise DataError(f"{path} lists {count} image{'s' * (count != 1)}; training needs 2 or more, with their poses")
     _check_values(meta, path.name)
     meta = with_focal_lengths(meta, path.parent)
-    kinds: Counter[str] = Counter()
+    kinds = set[str]()
     for index, frame in enumerate(frames):
         where = f"{path.name}, frame {index}"
         if not isinstance(frame, dict):
@@ -91,14 +90,13 @@ def check_transforms(path: Path, *, splits: Sequence[str] = ()) -> dict[str, Any
         _check_values({"transform_matrix": None, **frame}, where)
         if missing := [key for key in INTRINSICS if key not in meta and key not in frame]:
             raise DataError(f"{where}: {', '.join(missing)} missing; give them in each frame, or for all at the top")
-        kinds[lens_of(meta, frame, where).kind] += 1
+        kinds.add(lens_of(meta, frame, where).kind)
     for key in ("mask_path", "depth_file_path"):
         if (count := sum(key in frame for frame in frames)) not in (0, len(frames)):
             raise DataError(f"{path.name}: {count} of {len(frames)} frames have a {key}; give it in all or in none")
     if FISHEYE624 in kinds:  # nerfstudio makes the masks of such a lens, and reads it with no other kind
-        counts = ", ".join(f"{count} images with {kind}" for kind, count in sorted(kinds.items()))
         if len(kinds) > 1:
-            raise DataError(f"{path.name}: FISHEYE624 beside other lenses ({counts}); undistort the images")
+            raise DataError(f"{path.name}: lenses {' and '.join(sorted(kinds))} in one capture; undistort the images")
         _radius(meta.get("fisheye_crop_radius"), "fisheye_crop_radius", path.name)
         if "mask_path" in frames[0]:
             raise DataError(f"{path.name}: nerfstudio makes the masks of a FISHEYE624 camera; remove mask_path")
@@ -115,9 +113,8 @@ def check_transforms(path: Path, *, splits: Sequence[str] = ()) -> dict[str, Any
 
 
 def _check_values(entries: Mapping[str, Any], where: str) -> None:
-    for key, check in _CHECKS.items():
-        if key in entries:
-            check(entries[key], key, where)
+    for key in filter(entries.__contains__, _CHECKS):
+        _CHECKS[key](entries[key], key, where)
 
 
 def _must(holds: Callable[[Any], object], requirement: str) -> Callable[[Any, str, str], None]:

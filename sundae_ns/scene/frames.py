@@ -118,8 +118,7 @@ def principal_components(features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def feature_colors(features: Tensor, mean: Tensor, basis: Tensor, deviations: Tensor, alpha: Tensor) -> Tensor:
     """Rendered features ``[H, W, F]``, weighted by ``alpha``, as colours; [0, 1] are six deviations."""
-    components = (features - alpha * mean) @ basis
-    return (components / (6 * deviations.clamp_min(1e-8)) + 0.5 * alpha).clamp(0, 1)
+    return ((features - alpha * mean) @ basis / (6 * deviations.clamp_min(1e-8)) + 0.5 * alpha).clamp(0, 1)
 
 
 def response_values(response: Tensor) -> Tensor:
