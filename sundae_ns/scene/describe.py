@@ -54,8 +54,7 @@ def bytes_at(path: Path) -> int | None:
     """Bytes of the files or the folder of a scene; None for a run, which holds more than that."""
     if (kind := kind_of_gaussians(path)) is None and kind_of(path) is None and find_config(path) is not None:
         return None
-    folder = path.parent if path.name in METAS else path
-    files = rank_files(path) if kind == "gsplat" else {path, *folder.rglob("*")}
+    files = rank_files(path) if kind == "gsplat" else {path, *(path.parent if path.name in METAS else path).rglob("*")}
     return sum(file.stat().st_size for file in files if file.is_file())
 
 

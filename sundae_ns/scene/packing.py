@@ -117,8 +117,7 @@ def _head_of(packed: PackedScene, stated: Mapping[str, Any] | None) -> Compensat
     if stated is None or features != stated["num_features"]:
         raise refusal("another number of features than it has")
     integers = {name: int(stated[name]) for name in ("pixel_unshuffle", "num_features")}
-    config = HeadConfig(**{**stated, **integers}, start_at=0)
-    if (head := CompensationHead.of_weights(config, packed.head)) is None:
+    if (head := CompensationHead.of_weights(HeadConfig(**{**stated, **integers}, start_at=0), packed.head)) is None:
         raise refusal("another head than it has")
     return head
 
