@@ -244,8 +244,8 @@ def sizes_asked() -> list[str]:
     cells: dict[tuple[str, str], str] = {}
     rows = lines_of("sizes_asked.csv")
     for row in sorted(rows, key=lambda row: (row["source"], row["capture"], float(row["asked_mb"]))):
-        scene = row["capture"] + (", trained" if row["source"] == "trained" else "")
-        cells[row["asked_mb"], scene] = f"{float(row['got_mb']):.3f}, {float(row['psnr']):.1f}"
+        asked = row["asked_mb"] + (" by training" if row["source"] == "trained" else "")
+        cells[asked, row["capture"]] = f"{float(row['got_mb']):.3f}, {float(row['psnr']):.1f}"
     return side_by_side(cells, "MB asked")
 
 

@@ -127,7 +127,7 @@ def load_config(path: Path) -> Any:
 def _read(path: Path, loader: type[yaml.SafeLoader]) -> Any:
     remedy = "give the folder of a finished run, or its config.yml"
     with reading(path, "a run's config.yml, or of another version", CheckpointError, remedy=remedy, missing=remedy):
-        return yaml.load(regular(path).read_text(encoding="utf-8"), Loader=loader)
+        return loader(regular(path).read_text(encoding="utf-8")).get_single_data()
 
 
 class _ValueLoader(yaml.SafeLoader):

@@ -75,7 +75,7 @@ def contents_of(scene: Scene) -> PackedScene:
     source = {**scene.meta.get("source", {}), **({} if scene.in_model_frame else {"model_frame": False})}
     meta = {**scene.meta, "source": source, "model": model, **stated_start(scene)}
     if not scene.cameras:
-        return PackedScene(gaussians, head, None, meta, None)
+        return PackedScene(gaussians, head, None, meta)
     return PackedScene(gaussians, head, arrays_of_cameras(scene.cameras), meta, sensitivity_of(scene, scene.cameras))
 
 

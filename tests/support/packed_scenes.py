@@ -94,7 +94,7 @@ def write_kind(path: Path, kind: Kind) -> Path:
     focal = (kind.focal, kind.focal) if kind.head and kind.focal else None
     encoded = Gaussians(gaussians, "harmonics" if kind.degree else "logits")
     packed = contents_of(Scene(encoded, head, kind.background, kind.antialiased, focal, in_model_frame=True))
-    sensitivity = _sensitivity(gaussians, packed.head) if kind.measured else None
+    sensitivity = _sensitivity(gaussians, packed.head) if kind.measured else Sensitivity({}, {})
     write_fitted(path, *fit_scene(replace(packed, cameras=_cameras(), sensitivity=sensitivity), kind.config))
     return path
 

@@ -383,27 +383,27 @@ class Codecs:
 
 
 def fit_codecs(
-    gaussians: Mapping[str, Tensor], head: Mapping[str, Tensor], config: PackConfig, sensitivity: Sensitivity | None
+    gaussians: Mapping[str, Tensor], head: Mapping[str, Tensor], config: PackConfig, sensitivity: Sensitivity
 ) -> tuple[dict[str, Tensor], Codecs]:
     """Gaussians in the stored order, with rounded positions, and codecs fitted to them and to a head; {} for none."""
     names = [name for name in (*SPLAT_NAMES, FEATURES) if name in gaussians]
     values = {name: as_matrix(gaussians[name]) for name in names}
     order, near = scene_order(values["means"])
     filled = min(range(config.block, max(config.block // 2, 15), -1), key=lambda size: max(near % size, 16))
-    for block in (config.block, filled, *(max(config.block >> bits, 16) for bits in (2, 4, 6))):
-        # What lies far away makes a block coarse: blocks that the near ones fill, and else smaller ones, mend that.
-        config = replace(config, block=block)
-        blocks, within = quantize_positions(values["means"][order], config.position_bits, block)
-        grid = (blocks.high / 2**config.position_bits - blocks.low / 2**config.position_bits).max(axis=1)
-        widths = np.exp(values["scales"].max(axis=1).clip(max=80))[order[within]]
-        if (grid[np.arange(len(order)) // block] > 3 * widths)[:near].mean() < 1e-3:
+    widths = np.exp(values["scales"].max(axis=1).clip(max=80))
+    finer = range(config.position_bits, min(config.position_bits + 4, 16) + 1)
+    # What lies far away makes a block coarse: another bit takes 3 a Gaussian, blocks of a quarter take 7, 13 and 25.
+    for block, bits in itertools.product((filled, *(max(config.block >> by, 16) for by in (2, 4, 6))), finer):
+        blocks, within = quantize_positions(values["means"][order], bits, block)
+        grid = ((blocks.high.astype(np.float64) - blocks.low) / 2**bits).max(axis=1)
+        if (grid[np.arange(len(order)) // block] > 3 * widths[order[within]])[:near].mean() < 1e-3:
             break
+    config = replace(config, block=block, position_bits=bits)
     order = order[within]
     values = {name: value[order] for name, value in values.items()}
     values["means"] = blocks.positions(config.position_bits, config.block)
     values["quats"], values["scales"] = aligned(values["quats"], values["scales"])
     values["opacities"] = values["opacities"].clip(*_LOGITS)
-    sensitivity = sensitivity or Sensitivity({}, {})
     codecs: dict[str, Rotations | Transform] = {"quats": Rotations(config.rotation_step)}
     for name, option in _STEPS.items():
         if name != "quats" and name in values and values[name].size:

@@ -41,7 +41,7 @@ class PackedScene:
     head: dict[str, Tensor] = field(default_factory=dict)  # its state; empty without a head
     cameras: dict[str, Tensor] | None = None  # by the names of CAMERAS
     meta: dict[str, Any] = field(default_factory=dict)  # JSON: the model's configuration, frame, and other entries
-    sensitivity: Sensitivity | None = None  # what errors do to images; not stored; without it all weigh the same
+    sensitivity: Sensitivity = Sensitivity({}, {})  # what errors do to images; by default all weigh the same
 
 
 class PackReport(NamedTuple):

@@ -119,8 +119,8 @@ def test_the_bound_of_rotations_is_nearly_reached():
 def test_weights(kind, n, seed):
     x = hard_values(kind, n, 18, seed).reshape(n, 2, 3, 3)
     steps = module.weight_steps(torch.from_numpy(x), 1 / 127)[:, None]
-    found = module.weights_at(module.weight_levels(torch.from_numpy(x), steps), steps)
-    error, step = np.abs(found.double().numpy() - x).reshape(n, -1), steps.numpy()[:, 0]
+    found = module.weights_at(module.weight_levels(torch.from_numpy(x), steps), steps).double().numpy()
+    error, step = np.abs(found - x).reshape(n, -1), steps.numpy()[:, 0]
     assert (error <= step[:, None] / 2 * (1 + 1e-6) + ulp(x.reshape(n, -1))).all()
     assert (step <= np.abs(x.reshape(n, -1)).max(axis=1) / 127 * (1 + 1e-6) + 1e-44).all()
 
@@ -146,15 +146,20 @@ def test_transform(kind, n, seed):
 def test_one_that_is_far_away_leaves_all_others_in_their_place():
     field = random_field(3000, degree=0)
     far = {**field, "means": field["means"].index_fill(0, torch.tensor([1500]), 1e6)}
-    found = module.fit_codecs(far, {}, PackConfig(), None)[0]["means"]
+    found = module.fit_codecs(far, {}, PackConfig(), Sensitivity({}, {}))[0]["means"]
     assert (torch.cdist(field["means"], found).amin(dim=1) > 0.01).sum() < 16
+
+
+def test_narrow_gaussians_take_finer_cells_before_smaller_blocks():
+    field = {**random_field(3000, degree=0), "scales": torch.full((3000, 3), -8.0)}
+    config = module.fit_codecs(field, {}, PackConfig(position_bits=10), Sensitivity({}, {}))[1].config
+    assert min(config.position_bits - 10, config.block - 512) > 0
 
 
 @pytest.mark.parametrize("kind", ["normal", "outliers"])
 def test_a_transform_decorrelates_columns(kind):
     rng = np.random.default_rng(0)
-    x = np.repeat(hard_values(kind, 2000, 3, 0), 3, axis=1) + 0.001 * rng.normal(size=(2000, 9)).astype(np.float32)
-    x = x.astype(np.float32)
+    x = np.repeat(hard_values(kind, 2000, 3, 0), 3, axis=1) + rng.normal(0, 0.001, (2000, 9)).astype(np.float32)
     _, levels, _ = module.fit_transform(x, 0.03, centred=False).encode(x)
     zeros = (levels == 0).mean(axis=0)
     assert (zeros[3:] > 0.98).all()
@@ -291,10 +296,10 @@ def test_weights_that_show_less_are_coarser_at_the_same_total_error():
     head = {name: torch.randn(8, 8, 3, 3, generator=g) for name in ("a.weight", "b.weight")}
     shown = {name: torch.rand(8, 8, generator=g, dtype=torch.float64) + 0.5 for name in head}
     shown["b.weight"] /= 64
-    original = PackedScene(random_field(50), head)
     errors, sizes = [], []
-    for sensitivity in (None, Sensitivity({}, shown)):
-        _, codecs = fit_scene(replace(original, sensitivity=sensitivity), PackConfig(head_step=0.02))
+    for sensitivity in (Sensitivity({}, {}), Sensitivity({}, shown)):
+        scene = PackedScene(random_field(50), head, sensitivity=sensitivity)
+        codecs = fit_scene(scene, PackConfig(head_step=0.02))[1]
         moved = {name: codecs.head.rounded(name, value) - value for name, value in head.items()}
         errors.append(sum(float((shown[name] * moved[name].square().sum((2, 3))).sum()) for name in head))
         levels = codecs.head.encode(head)[1]
