@@ -15,14 +15,12 @@ from run_commands import config_of, write_run
 
 from sundae_ns.io.run_folder import LOCK, unfinished_run
 
-OURS = "sundae_ns.method_configs"
-
 
 def train(*words):
     return command_line.run("train", *words)
 
 
-@pytest.mark.parametrize("method", sorted(entry_points(group="nerfstudio.method_configs", module=OURS).names))
+@pytest.mark.parametrize("method", sorted(entry_points(module="sundae_ns.method_configs").names))
 def test_the_printed_command_runs(commands, capsys, method):
     assert train("scene", "-o", "my runs", "--method", method, "--steps", "700", "--keep", "0.05") == 0
     assert shlex.split(capsys.readouterr().out.splitlines()[0]) == commands.ran[0]
