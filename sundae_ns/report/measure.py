@@ -276,7 +276,7 @@ def measure(
         primitives=subject.source.total,
         bytes_primitives=stored[0],
         bytes_head=stored[1],
-        resolution=" and others".join([*resolutions[:1], *([""] if len(resolutions) > 1 else [])]),
+        resolution=resolutions[0] + " and others" if len(resolutions) > 1 else "".join(resolutions),
         configurations=tuple(
             Configuration(name, median(times[name]) if timed else None, needed[name], tuple(views[name]))
             for name in ways
