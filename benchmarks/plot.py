@@ -113,7 +113,7 @@ def changed_light(row: dict[str, Any]) -> str | None:
 def plot_asked() -> Any:
     """Asked sizes, levels of detail, cleaning, few photos, changed exposures and rules of pruning, a panel each."""
     figure, ((sizes, levels, cleaning), (few, light, rules)) = plt.subplots(2, 3, figsize=(11, 7), layout="constrained")
-    lines(sizes, "sizes_asked.csv", lambda row: f"{row['capture']} ({row['source']})", "got_mb", "psnr")
+    lines(sizes, "sizes_asked.csv", lambda row: row["source"] == "trained" and row["capture"], "got_mb", "psnr")
     lines(levels, "levels.csv", lambda row: row["tool"], "share", "psnr_to_field")
     default = {"views": "16", "seed": "42", "arm": "default"}.items()
     psnr = mean([row for row in lines_of("few_counts.csv") if row.items() >= default], "psnr")
@@ -125,7 +125,7 @@ def plot_asked() -> Any:
         spots = [(float(row["psnr_lost"]), int(row["removed"])) for row in fields]
         cleaning.plot(*zip(*spots), marker, label=strength, fillstyle="none")
     cleaning.legend(fontsize=7)
-    sizes.set(title="asked sizes", xlabel="MB got", ylabel="PSNR, dB")
+    sizes.set(title="asked sizes, trained", xlabel="MB got", ylabel="test PSNR, dB")
     levels.set(title="levels, mean of fields", xlabel="share of Gaussians", ylabel="PSNR to the field, dB")
     cleaning.set(title="cleaning by strength", xlabel="PSNR lost, dB", ylabel="floaters found of 400", ylim=(360, 401))
     few.set(title="few photos, mean of captures", xlabel="Gaussians kept, %", ylabel="test PSNR, dB", ylim=(18.2, 24))

@@ -145,7 +145,7 @@ class Camera(NamedTuple):
         return Camera(self.viewmat, K, width, height, self.focal * factor)
 
     def cut(self, crop: Crop) -> Camera:
-        """The camera of a window of the image; of a mirrored window, the camera of the mirror image."""
+        """The camera of a window of the image; of a mirrored window, that of the mirror image."""
         viewmat, K = self.viewmat, self.K.clone()
         K[0, 2] -= crop.left
         K[1, 2] -= crop.top

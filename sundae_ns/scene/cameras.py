@@ -38,7 +38,7 @@ def opening(scene: Scene) -> Scene:
 
 
 def cameras_of(path: Path | str, scene: Scene | None = None) -> list[Camera]:
-    """The cameras of a file, as ideal pinhole cameras: distortion is left out.
+    """The cameras of a file, as ideal pinhole cameras without distortion.
 
     Args:
         path: a ``transforms.json``, a COLMAP model, a folder with one of them, or a camera path of nerfstudio's viewer.

@@ -92,7 +92,7 @@ def transform(
 
 
 def merge(scenes: Iterable[Scene]) -> Scene:
-    """Several scenes, at least one, as one, in the order given: their Gaussians and stored cameras.
+    """Several scenes, at least one, as one, in their order: Gaussians and stored cameras.
 
     All else is that of the first scene: device, background, start view, coordinates. Those of others are not changed
     (:func:`transform` does it), except for survey coordinates, which fit. Missing SH degrees are zero. A head stays if
@@ -146,7 +146,7 @@ def _same(head: CompensationHead | None, other: CompensationHead | None) -> bool
 
 
 def crop(scene: Scene, low: AnyArray, high: AnyArray) -> Scene:
-    """The Gaussians whose centres are in a box, its faces included; everything else of the scene stays.
+    """The Gaussians with centres in a box, its faces included; all else stays.
 
     Args:
         scene: to cut; it does not change.

@@ -161,7 +161,7 @@ class Embedded:
 
 
 def show(scene: Scene, *, height: int = 480, title: str = "Scene") -> Embedded:
-    """The web page of a scene as the output of a notebook's cell, head included.
+    """The page of a scene, head included, as a notebook's output.
 
     The page, which the notebook stores, contains the scene, packed by default settings; of over 10 MB it warns.
 

@@ -71,7 +71,7 @@ class Scene:
     @classmethod
     @fitting()
     def from_points(cls, points: AnyArray, colors: AnyArray, *, sh_degree: int = 0) -> Scene:
-        """A scene of one Gaussian for each point, sized by the distance to its neighbours.
+        """One Gaussian for each point, sized by its neighbours.
 
         Args:
             points: positions ``[N, 3]``, world units.
@@ -138,7 +138,7 @@ class Scene:
 
     @fitting()
     def __getitem__(self, rows: slice | AnyArray) -> Scene:
-        """The scene with some of its Gaussians: ``scene[scene.opacities > 0.1]``; everything else stays, head included.
+        """Some of the Gaussians: ``scene[scene.opacities > 0.1]``; all else stays, head included.
 
         ``rows`` is a mask, bool ``[N]``, a slice, or indices ``[M]``; an array, a list or a tensor on any device.
         ``DataError`` for anything else, and for no Gaussians.
@@ -325,7 +325,7 @@ def image_of(rgb: Tensor) -> Image.Image:
 
 
 def render(scene: Scene, camera: Camera, *, head: bool = True, backend: BackendName = "auto") -> Rendering:
-    """Render one view of a scene, on the device of the scene.
+    """Render one view of a scene, on its own device.
 
     Differentiable once if a tensor of the Gaussians or the camera requires a gradient, or the head is in training mode.
 
@@ -365,7 +365,7 @@ def measure(
     head: bool = True,
     backend: BackendName = "auto",
 ) -> Quality:
-    """Compare the images of a scene with a reference.
+    """Compare images to a reference.
 
     Args:
         scene: to measure.
