@@ -66,8 +66,8 @@ def export(
         raise ConfigError("only a page shows two scenes, views or a start view; name it .html; sn.merge joins two")
     before = opened(scene, wishes, advanced, capture=page or lod)
     changes = bool(wishes.cleans or wishes.reduces)
-    if before.copies_rows(out) and (upright or not changes):
-        raise ConfigError(f"{scene} is a .ply already; name another suffix, or what to change, as --count")
+    if before.copies_rows(out) and (upright or not (changes or advanced.up)):
+        raise ConfigError(f"{scene} is a .ply already; name another suffix, or what to change, as --up")
     if upright and not before.scene.in_model_frame:
         raise ConfigError(f"{scene} is not in nerfstudio's coordinates, which --upright turns; leave it out")
     left = before if page else before.reduced(out, write=lambda edit, path: edit.write(path, upright=upright))

@@ -441,8 +441,8 @@ def test_commands_state_them_without_coding_the_scene_again(tmp_path):
     assert base64.b64decode(code) == after.read_bytes()
     sn.save(two_seen(), tmp_path / "a.ply")
     camera = written(tmp_path, CAPTURE)
-    packed = tmp_path / "b.sundae"
-    assert run("pack", tmp_path / "a.ply", "-o", packed, "--start-view", camera, "--up", 0, -1, 0) == 0
-    found = sn.load(packed)
-    assert found.up == (0, -1, 0)
-    assert found.start.center.tolist() == [0, 0, 3]
+    assert run("pack", tmp_path / "a.ply", "-o", tmp_path / "b.sundae", "--start-view", camera, "--up", 0, -1, 0) == 0
+    found = sn.load(tmp_path / "b.sundae")
+    assert (found.up, found.start.center.tolist()) == ((0, -1, 0), [0, 0, 3])
+    assert run("export", tmp_path / "a.ply", "-o", tmp_path / "b.ply", "--up", 0, 0, -1) == 0
+    assert sn.load(tmp_path / "b.ply").up == (0, 0, -1)
