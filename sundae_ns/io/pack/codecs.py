@@ -392,15 +392,15 @@ def fit_codecs(
     filled = min(range(config.block, max(config.block // 2, 15), -1), key=lambda size: max(near % size, 16))
     widths = np.exp(values["scales"].max(axis=1).clip(max=80))
     finer = range(config.position_bits, min(config.position_bits + 4, 16) + 1)
+    smaller = (max(config.block >> by, 16) for by in (2, 4, 6))
     # What lies far away makes a block coarse: another bit takes 3 a Gaussian, blocks of a quarter take 7, 13 and 25.
-    for block, bits in itertools.product((filled, *(max(config.block >> by, 16) for by in (2, 4, 6))), finer):
+    for block, bits in ((config.block, config.position_bits), *itertools.product((filled, *smaller), finer)):
         blocks, within = quantize_positions(values["means"][order], bits, block)
         grid = ((blocks.high.astype(np.float64) - blocks.low) / 2**bits).max(axis=1)
         if (grid[np.arange(len(order)) // block] > 3 * widths[order[within]])[:near].mean() < 1e-3:
             break
     config = replace(config, block=block, position_bits=bits)
-    order = order[within]
-    values = {name: value[order] for name, value in values.items()}
+    values = {name: value[order[within]] for name, value in values.items()}
     values["means"] = blocks.positions(config.position_bits, config.block)
     values["quats"], values["scales"] = aligned(values["quats"], values["scales"])
     values["opacities"] = values["opacities"].clip(*_LOGITS)
