@@ -7,11 +7,10 @@ moved and turned a little, and the images of no camera are overfitted.
 from __future__ import annotations
 
 import dataclasses
-import inspect
 import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, ParamSpec, cast
+from typing import Any, cast
 
 import torch
 from pytorch_msssim import SSIM
@@ -42,11 +41,13 @@ SIDES = {"cpu": 128, "cuda": 512}  # Sides of the images by the device, pixels
 LEVELS = (0.5, 0.25, 0.1)  # Shares of the levels of detail below the full one
 LEVEL_STEPS = {"cpu": 300, "cuda": 4000}  # Steps of each by the device
 CAMERAS, HELD_OUT = 256, 16  # Virtual cameras that the steps begin from, and most held-out cameras
-P = ParamSpec("P")
 
 
 class Distillation:
-    """The training of a pruned scene on the images of a full one; arguments and errors as :func:`distill`."""
+    """The training of a pruned scene on the images of a full one; arguments and errors as :func:`distill`.
+
+    ``progress`` says whether the prune shows a progress bar.
+    """
 
     @usual_defaults()
     @torch.no_grad()
@@ -256,19 +257,17 @@ class Distillation:
             state.head_starts_at = -math.inf
 
 
-def _with_parameters_of(begin: Callable[P, object]) -> Callable[[Callable[..., Scene]], Callable[P, Scene]]:
-    """Let a function that passes all of its arguments on state their names, types and defaults."""
-
-    def stated(function: Callable[..., Scene]) -> Callable[P, Scene]:
-        signature = inspect.signature(begin).replace(return_annotation="Scene")
-        function.__signature__ = signature  # type: ignore[attr-defined]
-        return function
-
-    return stated
-
-
-@_with_parameters_of(Distillation)
-def distill(*arguments: Any, **options: Any) -> Scene:
+def distill(
+    scene: Scene,
+    *,
+    keep: float | None = None,
+    count: int | None = None,
+    cameras: Sequence[Camera] | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    head: bool = True,
+    size: int | None = None,
+) -> Scene:
     """Prune a scene, and train what is left on the images of the full one. Needs no photos, but nerfstudio.
 
     Args:
@@ -281,7 +280,6 @@ def distill(*arguments: Any, **options: Any) -> Scene:
         seed: of all random draws.
         head: whether to add a compensation head if the held-out views show that it pays.
         size: sides of the images of virtual cameras, pixels; by default 512 on a GPU, 128 on a CPU.
-        progress: show a progress bar of the prune on stderr.
 
     Returns:
         The small scene, on the same device.
@@ -296,9 +294,9 @@ def distill(*arguments: Any, **options: Any) -> Scene:
     >>> sn.distill(scene, keep=0.5, cameras=sn.virtual_cameras(scene, 4, size=32), steps=4, head=False).num_gaussians
     100
     """
-    training = Distillation(*arguments, **options)
-    training.train(lambda *_: True)
-    return training.result()
+    made = Distillation(scene, keep=keep, count=count, cameras=cameras, steps=steps, seed=seed, head=head, size=size)
+    made.train(lambda *_: True)
+    return made.result()
 
 
 def levels_of(
