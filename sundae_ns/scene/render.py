@@ -187,7 +187,6 @@ def contribution(
     from rich.progress import track  # takes 20 ms, which a render without a prune need not spend
 
     total = source.gaussians["means"].new_zeros(source.gaussians.num_gaussians)
-    label = "Contribution of Gaussians"
     largest = source.gaussians["scales"].amax(dim=1).exp()
 
     @torch.no_grad()
@@ -217,7 +216,8 @@ def contribution(
         return rows, torch.autograd.grad(blended, colors)[0][:, 0], image
 
     views = (two_at_once if total.is_cpu else map)(of_view, cameras)
-    for rows, new, image in track(views, label, len(cameras), transient=True, console=console, disable=not console):
+    bar: dict[str, Any] = {"console": console, "transient": True, "disable": not (console and console.is_terminal)}
+    for rows, new, image in track(views, "Contribution of Gaussians", len(cameras), **bar):
         total[rows] += new
         if images is not None and count is not None:  # only a pass that weights by detail renders the image
             images.append(image)

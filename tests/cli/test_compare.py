@@ -105,8 +105,9 @@ def test_info_says_what_a_file_holds(folder, capsys):
     assert facts["low"] == pytest.approx(scene.gaussians["means"].amin(dim=0).tolist())
     assert 0 <= facts["invisible"] < 0.5
     assert run("info", folder / "whole.sundae") == 0
-    said = capsys.readouterr().out
+    said, warned = capsys.readouterr()
     assert "invisible             0.0% of the Gaussians, to 3 cameras" in said
+    assert not warned, "a bar leaves no line where stderr is no terminal"
     box = said.partition("--crop ")[2].split()[:6]
     assert run("export", folder / "whole.sundae", "-o", folder / "cut.spz", "--crop", *box) == 0
     assert sn.load(folder / "cut.spz").num_gaussians > 290
