@@ -9,11 +9,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Literal, cast
+from typing import Annotated, Any, Literal, cast
 
 import cv2
 import numpy as np
 import torch
+import tyro
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.datamanagers import full_images_datamanager
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
@@ -115,9 +116,9 @@ class SundaeDatamanagerConfig(FullImageDatamanagerConfig):
     """Full images, in an order that depends on the seed and the step alone."""
 
     _target: type = field(default_factory=lambda: SundaeDatamanager)
-    robust_frame: bool = False
-    """Centre and scale the scene by the cameras that stand near each other, and shift survey coordinates in float64.
-    False takes all cameras, as nerfstudio does."""
+    robust_frame: Annotated[bool, tyro.conf.Suppress] = False
+    """Of the method: the scene is centred and scaled by the cameras that stand near each other, and survey coordinates
+    are shifted in float64. False takes all cameras, as nerfstudio does."""
 
     @property
     def capture(self) -> Path:
