@@ -77,7 +77,7 @@ def export(
         named = {name: link for name, _, link in (word.partition("=") for word in views)}
         first = before.for_page(out, lambda path, first: write_page(path, first, *second, views=named))
         size = write_page(out, first, *second, views=named)
-        print(f"{out}: {size:,} bytes; {'open it in a browser' if suffix else 'serve it'}")
+        print(f"{out}: {size:,} bytes; {'open it in a browser' if suffix else f'serve it; scene: {len(first[2]):,}'}")
         costs = kind_of(scene) != "packed" or first[1] is not before.scene
     elif lod:
         _write_levels(left.scene.to(fastest_device()), out, upright=upright)

@@ -90,6 +90,7 @@ def test_commands_say_what_a_change_costs(folder, capsys, monkeypatch):
             figures = [float(row[name]) for name in ("MB", "PSNR, dB", "SSIM", "worst, dB")]
             found = re.fullmatch(r"(.*) MB \(of .*\); (.*) dB, (.*) against .*, worst (.*)", said[-1])
             assert [float(value) for value in found.groups()] == pytest.approx(figures, abs=0.051)
+        assert " -o e" not in words or said[-2].endswith(f"; scene: {(folder / 'e/scene.sundae').stat().st_size:,}")
     assert (sn.load("b.html").num_gaussians, len(sn.load("e/scene.sundae").cameras)) == (150, 3)
 
 

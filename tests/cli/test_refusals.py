@@ -103,7 +103,6 @@ REFUSALS = {
     "poses empty -o out": "empty holds no photos",
     "poses text.mp4 -o out": "text.mp4 is not a video that",
     "poses photos/0.JPG -o out": "sundae prune takes scenes",
-    "poses photos -o used": "used holds files; choose another folder",
     "poses photos -o photos/capture": "photos/capture lies in photos",
     "poses photos -o out --frames 2": "frames is 2; give at least 3",
     "poses photos -o out --masks gone": "photos/0.JPG has no mask 0.png in gone; add it",
