@@ -13,6 +13,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
 
+# Before torch reads it. Tests are small: a second thread gains little, and spins on a busy machine. Commands that tests
+# start inherit this, so their sums are the same as those of this process.
+os.environ["OMP_NUM_THREADS"] = "1"
+
 import hypothesis
 import pytest
 import torch
@@ -64,10 +68,6 @@ extern "C" void at(unsigned block) { blockIdx.x = block; }
 
 
 def pytest_configure() -> None:
-    # Tests are small: a second thread gains little, and waits on a busy machine. Commands that tests start inherit
-    # this, so their sums are the same as those of this process.
-    os.environ["OMP_NUM_THREADS"] = "1"
-    torch.set_num_threads(1)
     # A test on a busy machine may be slow, so examples have no deadline.
     hypothesis.settings.register_profile("few", max_examples=10, deadline=None)
     hypothesis.settings.register_profile("all", max_examples=200, deadline=None)

@@ -26,7 +26,7 @@ _NODES = 144  # no power of two: contexts would share the sets of a cache
 _LAST = 24
 _CLASSES = 16
 _KINDS = 63 + _CLASSES * _CLASSES
-_EVEN = 1 << 15
+_EVEN = np.int64(1 << 15)  # as all constants given to inlined loops: numba compiles them anew for each literal int
 
 Stream = NDArray[np.uint8]
 Near = NDArray[np.int32]  # rows ``[N, NEIGHBOURS]`` before each row, the nearest first; -1 for none
@@ -99,11 +99,11 @@ def _decided(coder, stream, chances, kinds, row, node, bit):  # type: ignore[no-
 @inlined
 def _number(coder, stream, chances, kinds, first, value, reading):  # type: ignore[no-untyped-def]
     """Code a number: is it 0, its sign, how many binary digits it has, and these; the number, and the coder."""
-    bit, coder = _decided(coder, stream, chances, kinds, first, 0, -1 if reading else (1 if value == 0 else 0))
+    bit, coder = _decided(coder, stream, chances, kinds, first, np.int64(0), -1 if reading else int(value == 0))
     if bit == 1:
         return 0, coder
     bit = -1 if reading else (1 if value < 0 else 0)
-    negative, coder = _decided(coder, stream, chances, kinds, first + 1, 1, bit)
+    negative, coder = _decided(coder, stream, chances, kinds, first + 1, np.int64(1), bit)
     size = abs(value)
     digits = 0
     while digits < _LAST - 1:
@@ -190,8 +190,8 @@ def _run_gaps(codes, block, bits, chances, stream, coder, reading):  # type: ign
             gap = codes[i] - previous
             while gap >> digits > 0:
                 digits += 1
-        kinds = 0, 1 + last, 65 + before, 129 + (average >> 2)
-        node = 1
+        kinds = np.int64(0), 1 + last, 65 + before, 129 + (average >> 2)
+        node = np.int64(1)
         for k in range(6):
             bit = -1 if reading else (digits >> (5 - k)) & 1
             bit, coder = _decided(coder, stream, chances, kinds, node, node, bit)
@@ -202,7 +202,7 @@ def _run_gaps(codes, block, bits, chances, stream, coder, reading):  # type: ign
             bit = -1 if reading else (gap >> k) & 1
             kind = digits - 2 - k
             if kind < 2:
-                node = 64 + (1 if kind == 0 else size & 3)
+                node = np.int64(64 + (1 if kind == 0 else size & 3))
                 bit, coder = _decided(coder, stream, chances, kinds, node, node, bit)
             else:
                 bit, coder = _coded(coder, stream, _EVEN, bit)
