@@ -100,6 +100,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return next((number for number, first in enumerate(_FIRST) if name.is_relative_to(first)), len(_FIRST))
 
     items.sort(key=place)
+    gc.freeze()  # what imports left is not looked through again, by pytest at the end neither
     skips = {} if ALL_SEEDS else {"long": "takes a minute or more: make test-all"}
     skips |= {} if torch.cuda.is_available() else {"gpu": "no CUDA device here"}
     for item in items:

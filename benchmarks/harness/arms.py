@@ -10,12 +10,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import tyro
 import yaml
 
 from harness.plan import WARM_UP, Arm, Kind, Words
 from sundae_ns.core.errors import ConfigError
+from sundae_ns.io.pack.container import jsonschema  # without a grammar that takes it a second to compile
 
 DEFAULT_FILE = Path(__file__).with_name("arms.yaml")
 """The default arms; also an example of a file of arms."""
