@@ -63,11 +63,11 @@ def rasterize_cameras(inputs: Inputs, viewmats: Tensor, Ks: Tensor, *, backend: 
 
 
 def two_at_once(function: Callable[[Any], T], views: Iterable[Any]) -> Iterator[T]:
-    """As ``map``, for views on a CPU: two at a time, each on half of the threads."""
+    """As ``map``, for views on a CPU: two at a time, each on half of the threads; of one thread, one."""
     threads = torch.get_num_threads()
     torch.set_num_threads(threads)  # two threads cannot make the pool of a forked process
     try:
-        with ThreadPoolExecutor(2, initializer=torch.set_num_threads, initargs=(max(1, threads // 2),)) as pool:
+        with ThreadPoolExecutor(min(2, threads), "views", torch.set_num_threads, (max(1, threads // 2),)) as pool:
             yield from pool.map(function, views)
     finally:
         torch.set_num_threads(threads)

@@ -19,6 +19,7 @@ N = 60  # Gaussians of a model that is built without a count
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
 def test_contribution_is_the_weight_in_the_pictures(build, datamanager, mode):
+    torch.set_num_threads(2)  # two views at a time
     model = build(rasterize_mode=mode)
     # Thinner than a pixel, where the two modes differ by far.
     model.gauss_params["scales"].data[:30] = -6.0
@@ -40,8 +41,7 @@ def test_what_masks_leave_out_of_training_asks_for_no_primitives(build, datamana
     model = build()
     model.gauss_params["scales"].data[:] = -4.0
     whole = model.contribution(datamanager, count)
-    left = torch.zeros(32, 40, 1, dtype=torch.bool)
-    left[:, :20] = True
+    left = (torch.arange(40) < 20).expand(32, 40)[..., None]
     parts = []
     for datamanager.mask in (left, ~left):
         parts.append(model.contribution(datamanager, count))
