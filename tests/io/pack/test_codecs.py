@@ -154,6 +154,8 @@ def test_narrow_gaussians_take_finer_cells_before_smaller_blocks():
     field = {**random_field(3000, degree=0), "scales": torch.full((3000, 3), -8.0)}
     config = module.fit_codecs(field, {}, PackConfig(position_bits=10), Sensitivity({}, {}))[1].config
     assert min(config.position_bits - 10, config.block - 512) > 0
+    field["scales"] -= 30
+    assert module.fit_codecs(field, {}, PackConfig(block=32), Sensitivity({}, {}))[1].config.block == 16
 
 
 @pytest.mark.parametrize("kind", ["normal", "outliers"])
