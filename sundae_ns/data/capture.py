@@ -113,8 +113,9 @@ def check_transforms(path: Path, *, splits: Sequence[str] = ()) -> dict[str, Any
 
 
 def _check_values(entries: Mapping[str, Any], where: str) -> None:
-    for key in filter(entries.__contains__, _CHECKS):
-        _CHECKS[key](entries[key], key, where)
+    for key, check in _CHECKS.items():
+        if key in entries:
+            check(entries[key], key, where)
 
 
 def _must(holds: Callable[[Any], object], requirement: str) -> Callable[[Any, str, str], None]:

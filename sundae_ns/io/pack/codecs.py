@@ -393,7 +393,7 @@ def fit_codecs(
     widths = np.exp(values["scales"].max(axis=1).clip(max=80))
     finer = range(config.position_bits, min(config.position_bits + 4, 16) + 1)
     smaller = (max(config.block >> by, 16) for by in (2, 4, 6))
-    # What lies far away makes a block coarse: another bit takes 3 a Gaussian, blocks of a quarter take 7, 13 and 25.
+    # What lies far away makes a block coarse: another bit for each coordinate costs less than smaller blocks.
     for block, bits in ((config.block, config.position_bits), *itertools.product((filled, *smaller), finer)):
         blocks, within = quantize_positions(values["means"][order], bits, block)
         grid = ((blocks.high.astype(np.float64) - blocks.low) / 2**bits).max(axis=1)
