@@ -344,7 +344,7 @@ class SundaeModel(SplatfactoModel):
     ) -> dict[str, Tensor]:
         """Terms of the loss by name, each ``[]``: see :class:`.StepLosses`; in training also the camera optimizer's."""
         target, mask = self.target(batch, outputs), self.mask(batch, outputs.get("window"))
-        losses = self.losses(self.state, self.state.gaussians, outputs["rgb"], outputs["base_rgb"], target, mask)
+        losses = self.losses(self.state, self.source, outputs["rgb"], outputs["base_rgb"], target, mask)
         if self.training:
             self.camera_optimizer.get_loss_dict(losses)
             self.exposure_compensation.observe(outputs["rgb"], target, mask, batch)

@@ -271,14 +271,11 @@ class RecordedStep:
         """
         if (held := self._held) is None or not held.unchanged(state, settings):
             held = self._held = self._hold(state, settings)
-        values = [*(float(group["lr"]) for _, _, group in held.groups), float(state.gaussians.num_gaussians)]
+        values = [float(group["lr"]) for _, _, group in held.groups]
         # Pinned: copying from other memory would wait until the GPU has finished the last step.
         pinned = torch.tensor(values, dtype=torch.float32, pin_memory=state.device.type == "cuda")
-        numbers = pinned.to(state.device, non_blocking=True)
-        # The prior of a field that grows is a mean over fewer rows than the buffers have.
-        count = numbers[-1] if state.densifying and self._losses.prior_weight(state) > 0 else None
         kind = _kind(state, inputs, settings)
-        inputs = replace(inputs, rates=numbers[:-1], count=count)
+        inputs = replace(inputs, rates=pinned.to(state.device, non_blocking=True))
         result = self._recordings.run(partial(self._step, state, held), inputs, settings, kind, held.addresses)
         if result is not None:
             state.info = {COUNTED: True}

@@ -7,7 +7,6 @@ and fine-tunes run both halves in one call. Several ranks give another source of
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, cast
 
@@ -41,18 +40,16 @@ class StepLosses:
     def __call__(
         self,
         state: TrainingState,
-        params: Mapping[str, Tensor],
+        source: GaussianSource,
         rgb: Tensor,
         base: Tensor,
         target: Tensor,
         mask: Tensor | None,
-        count: Tensor | None = None,
     ) -> dict[str, Tensor]:
         """The terms by name, each ``[]``, for an image ``rgb``, its base colours and the truth, all ``[H, W, 3]``.
 
-        ``state`` says what is enabled at this step. ``params`` have logits ``opacities`` ``[N, 1]`` and logarithms
-        ``scales`` ``[N, 3]``; rows beyond ``count`` ``[]`` of them, if given, are transparent and without width.
-        ``mask`` ``[H, W, 1]`` has the pixels that count, None for all.
+        ``state`` says what is enabled at this step; ``source`` has the Gaussians, or a shard of them. ``mask`` ``[H, W,
+        1]`` has the pixels that count, None for all.
         """
         if mask is not None:
             target, rgb, base = target * mask, rgb * mask, base * mask
@@ -63,17 +60,15 @@ class StepLosses:
         losses = {"main_loss": main_loss}
         if base_loss is not None:
             losses["base_loss"] = options.base_loss_weight * base_loss
-        if (weight := self.prior_weight(state)) > 0:
+        if state.pruned and options.prior_after_prune > 0:
+            # A prior counts once, and the loss is of one image of many.
+            weight = options.prior_after_prune / max(self.num_images, 1)
             # Unused Gaussians become transparent and small (equation 10 of 3DGS-MCMC). In a pruned field they would
             # fit what differs between the training images.
-            for name, values in (("opacity", params["opacities"].sigmoid()), ("scale", params["scales"].exp())):
-                mean = values.mean() if count is None else values.sum() / (values.shape[1] * count)
-                losses[f"{name}_loss"] = weight * mean
+            opacities, scales = source.gaussians["opacities"].sigmoid(), source.gaussians["scales"].exp()
+            for name, values in (("opacity", opacities), ("scale", scales)):
+                losses[f"{name}_loss"] = weight * (values.sum() / (values.shape[1] * source.total))
         return losses
-
-    def prior_weight(self, state: TrainingState) -> float:
-        """Weight of opacities and scales at this step: a prior counts once, and the loss is of one image of many."""
-        return self.options.prior_after_prune / max(self.num_images, 1) if state.pruned else 0.0
 
 
 def image_losses(
@@ -169,10 +164,9 @@ class StepInputs:
     background: Tensor  # Colour [3]
     crop: Crop | None = None  # The part of the training image that is shown; None for the whole image
     rates: Tensor | None = None  # Learning rates of the groups of parameters [G]; None where the optimizer holds them
-    count: Tensor | None = None  # Number of Gaussians [], where parameters have rows for more
 
     def _tensors(self) -> list[Tensor]:
-        tensors = (self.camera.viewmat, self.camera.K, self.target, self.background, self.mask, self.rates, self.count)
+        tensors = (self.camera.viewmat, self.camera.K, self.target, self.background, self.mask, self.rates)
         return [value.detach() for value in tensors if value is not None]
 
     def clone(self) -> StepInputs:
@@ -182,7 +176,7 @@ class StepInputs:
             return None if value is None else value.detach().clone(memory_format=torch.contiguous_format)
 
         camera = self.camera._replace(viewmat=copy(self.camera.viewmat), K=copy(self.camera.K))
-        tensors = {name: copy(getattr(self, name)) for name in ("target", "mask", "background", "rates", "count")}
+        tensors = {name: copy(getattr(self, name)) for name in ("target", "mask", "background", "rates")}
         return replace(self, camera=camera, **tensors)
 
     def copy_to(self, other: StepInputs) -> None:
@@ -227,7 +221,7 @@ def training_step(
     with torch.enable_grad():
         images, splatted = render_view(source, inputs.camera, inputs.background, settings, depth=False)
         rgb, base = images["rgb"], images["base_rgb"]
-        terms = losses(state, source.gaussians, rgb, base, inputs.target, inputs.mask, inputs.count)
+        terms = losses(state, source, rgb, base, inputs.target, inputs.mask)
         loss = functools.reduce(torch.add, terms.values())
     kept = {name: images[name].detach() for name in ("rgb", "base_rgb", "accumulation")}
     return loss, splatted, StepResult(kept, {name: value.detach() for name, value in terms.items()}, loss.detach())

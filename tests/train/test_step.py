@@ -1,6 +1,7 @@
 """The training step: both halves and the whole, its inputs, and the terms of its loss."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -131,7 +132,7 @@ def test_after_the_prune_the_root_of_the_mean_square_takes_the_place_of_l1(build
 
 
 def test_a_pruned_field_has_a_prior_that_counts_once(build, perturb, camera, batch):
-    """Twice as many training images halve its weight in the loss of one."""
+    """Twice as many training images halve its weight in the loss of one, and so does a second shard."""
     model = perturb(build(prior_after_prune=0.6)).eval()
     outputs, target = model.get_outputs(camera()), batch()
     assert "opacity_loss" not in model.get_loss_dict(outputs, target)
@@ -142,6 +143,9 @@ def test_a_pruned_field_has_a_prior_that_counts_once(build, perturb, camera, bat
         opacities, scales = model.gauss_params["opacities"].sigmoid(), model.gauss_params["scales"].exp()
         torch.testing.assert_close(found["opacity_loss"], 0.6 / count * opacities.mean())
         torch.testing.assert_close(found["scale_loss"], 0.6 / count * scales.mean())
+    model.source = SimpleNamespace(gaussians=model.state.gaussians, total=2 * model.num_points)
+    shard = model.get_loss_dict(outputs, target)
+    assert all(torch.equal(2 * shard[name], found[name]) for name in ("opacity_loss", "scale_loss"))
     model.losses = StepLosses(build(prior_after_prune=0.0).config, model.ssim, 1)
     assert set(model.get_loss_dict(outputs, target)) == {"main_loss", "base_loss"}
 
