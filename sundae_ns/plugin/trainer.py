@@ -179,7 +179,8 @@ class SundaeTrainer(Trainer):
         if step < self._batch_ends:
             self._step_schedulers()
         else:
-            self._batch_ends = step + self.ranks.count
+            # After a resume the first batch may be a part: harmonics and gains of photos are due at multiples.
+            self._batch_ends = step - step % self.ranks.count + self.ranks.count
             if all(callback.trains(model.state) for callback in model.train_callbacks):
                 self._result = self._recorded_iteration(step) or self._iteration(step)
                 if self.ranks.count > 1:

@@ -34,8 +34,7 @@ from sundae_ns.plugin.trainer import SundaeTrainer
 from sundae_ns.train import averaging
 
 RANKS = 2
-LIMIT = 600
-"""Seconds that a program may take on a busy machine."""
+LIMIT = 600  # Seconds that a program may take on a busy machine
 NAMES = ("means", "quats", "scales", "opacities", "features_dc", "features_rest")
 STEPS, KEEP, PRUNE_AT, SAVED_AT = 40, 0.4, 32, 26
 
@@ -122,16 +121,20 @@ def check_frozen(rank, folder):
 
 
 def check_few(rank, folder):
-    """A field of one Gaussian trains, is saved and resumed, with nothing on one rank."""
+    """A field of one Gaussian trains, is saved and resumed within a batch, with nothing on one rank."""
     config = frozen(folder, "few")
     config.pipeline.model.pruning.keep_ratio = 1e-6
+    config.max_num_iterations = RANKS + 1
     train(config, rank, RANKS)
     config = frozen(folder, "few again")
-    config.load_checkpoint = saved(folder, "few", RANKS - 1)
+    config.load_checkpoint = saved(folder, "few", RANKS)
     config.max_num_iterations = 2 * RANKS
     trainer = train(config, rank, RANKS)
-    assert trainer.step == 3 * RANKS - 1
+    assert trainer.step == 3 * RANKS
     assert trainer.model.source.sizes == [0, 1]
+    (moments,) = trainer.optimizers.optimizers["features_rest"].state.values()
+    before = checkpoint.read(config.load_checkpoint)["optimizers"]["features_rest"]["state"][0]
+    assert moments["step"] == before["step"] + 1
 
 
 def checks(folder):
@@ -244,7 +247,7 @@ def test_ranks_stop_together_and_save_after_a_signal_of_the_terminal(folder):
     assert printed.count("--load-dir") == 1, "the first rank says how to resume"
     assert "Traceback" not in printed
     # They agree after each sixteenth batch.
-    assert checkpoint.checkpoints(models(folder, "stops")) == [saved(folder, "stops", 16 * RANKS)]
+    assert checkpoint.checkpoints(models(folder, "stops")) == [saved(folder, "stops", 17 * RANKS - 1)]
 
 
 def test_a_signal_to_the_command_ends_it_or_reaches_the_ranks(still_life, tmp_path, capsys, monkeypatch):
