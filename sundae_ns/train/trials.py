@@ -261,6 +261,8 @@ class Trials(Callback):
             if state.pruning["num_prunes"] and not progress.stage:  # by a share that was given
                 progress.chosen["count"] = 0
             elif reason is not None:
+                if progress.stage:  # one GPU has begun them, and has pruned for a trial
+                    self.go_back("start", state)
                 self._keep_usual(run, reason)
             else:
                 self.coming["count"] = self._judges

@@ -17,7 +17,7 @@ from sundae_ns.head.head import CompensationHead, HeadConfig
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
 from sundae_ns.train import trials as trials_module
 from sundae_ns.train.choice import HeldOutQuality, Tried
-from sundae_ns.train.pruning import PruningConfig
+from sundae_ns.train.pruning import COUNT, MANY_VIEWS, NEVER, PruningConfig
 from sundae_ns.train.schedules import Decay
 from sundae_ns.train.trials import Progress, Trial, Trials, packed_size
 
@@ -152,6 +152,18 @@ def test_a_state_in_the_middle_of_a_trial_is_resumed(run, monkeypatch):
     assert other.measure(run)[0].psnr == 4.0  # of the steps 2 to 6
     other.go_back("start", state)
     assert (height(run), other.taken_back) == (0.0, 6)
+
+
+def test_several_gpus_prune_the_field_from_which_counts_were_tried(run):
+    trials, state = trials_for(run.state), run.state
+    trials.keep("start", state, head=False)
+    trials.start(run, "count", 5, [], width=0)
+    run.train(trials, most=2)
+    state.pruning.update(pruned_at=0, num_prunes=1)
+    run.view_indices, run.folder = lambda: [*range(MANY_VIEWS)], None
+    run.images_per_step, run.last_step, run.schedule_length = 2, 99, 100
+    trials.before_training(run)
+    assert (height(run), state.pruning["pruned_at"], state.pruning[COUNT]) == (0.0, NEVER, 0)
 
 
 def test_trials_are_there_for_an_undecided_head_which_is_disabled_or_an_undecided_count(build):
