@@ -17,7 +17,7 @@ import torch
 from rich.progress import track
 from torch import Tensor
 
-from sundae_ns.core.errors import CheckpointError
+from sundae_ns.core.errors import CheckpointError, PackError
 from sundae_ns.core.gaussians import FEATURES, rgb_to_logit, sh_to_rgb
 from sundae_ns.core.surgery import replace_parameter
 from sundae_ns.io.coordinates import similarity
@@ -43,7 +43,7 @@ class Start:
     """Warnings or an error to report when training starts. A checkpoint that is loaded first makes them irrelevant."""
 
     warnings: tuple[str, ...] = ()
-    failure: CheckpointError | None = None  # Why the model could not start from its warm start
+    failure: CheckpointError | PackError | None = None  # Why the model could not start from its warm start
 
     def announce(self) -> None:
         """Log the warnings, or raise the failure."""
@@ -64,7 +64,7 @@ def initial_gaussians(options: Any, points: Points | None, frame: Frame | None) 
             params, start = _sparse_gaussians(options, points)
         else:
             params, start = _warm_gaussians(options, options.warm_start, frame), Start()
-    except CheckpointError as error:
+    except (CheckpointError, PackError) as error:
         params, start = _sparse_gaussians(options, points)[0], Start(failure=error)
     if options.num_features:
         params[FEATURES] = initial_features(params["features_dc"], options.num_features)

@@ -7,9 +7,10 @@ import pytest
 import torch
 from foreign_files import FOREIGN, small_field
 
-from sundae_ns.core.errors import CheckpointError
+from sundae_ns.core.errors import CheckpointError, PackError
 from sundae_ns.core.gaussians import sh_to_rgb
 from sundae_ns.io.coordinates import similarity
+from sundae_ns.io.pack.container import MAGIC
 from sundae_ns.io.ply import write_ply
 from sundae_ns.plugin.datamanager import DATASET_FRAME
 from sundae_ns.train import initialize
@@ -105,9 +106,11 @@ def test_a_finished_run_opens_without_what_it_started_from(build, training_of, t
     _ply(build, tmp_path / "a.ply")
     state = build(warm_start=tmp_path / "a.ply", warm_start_frame="model").state_dict()
     (tmp_path / "a.ply").unlink()
-    orphan = build(warm_start=tmp_path / "a.ply", warm_start_frame="model")
-    with pytest.raises(CheckpointError, match="does not exist"):
-        training_of(orphan)
+    (tmp_path / "b.sundae").write_bytes(MAGIC)  # a damaged pack
+    for name, error, words in (("a.ply", CheckpointError, "does not exist"), ("b.sundae", PackError, "whole")):
+        orphan = build(warm_start=tmp_path / name, warm_start_frame="model")
+        with pytest.raises(error, match=words):
+            training_of(orphan)
     orphan.load_state_dict(state)
     assert torch.equal(orphan.means, state["gauss_params.means"])
     training_of(orphan)
