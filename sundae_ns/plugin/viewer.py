@@ -98,7 +98,7 @@ class ViewerControls(torch.nn.Module):
         self._state, self._configured, self._contribute, self._curve = state, configured, contribute, curve
         self._lock = threading.Lock()
         self._previewed: tuple[int, ...] = ()  # Of the Gaussians that were previewed
-        self._graphs: dict[str, NeighborGraph] = {}
+        self._graphs: dict[tuple[str, bool], NeighborGraph] = {}
         self._contributions: dict[int | None, Tensor] = {}
         self._previews: dict[tuple[str, float], Pruned | None] = {}
 
@@ -165,8 +165,9 @@ class ViewerControls(torch.nn.Module):
         gaussians = self._state.gaussians
         usable = sanitise(gaussians).gaussians
         count = kept_count(ratio, usable.num_gaussians)
-        if rule.uses_graph and rule.edges not in self._graphs:
-            self._graphs[rule.edges] = gaussian_graph(usable, rule)
+        kind = rule.edges, rule.uses_edge_weights
+        if rule.uses_graph and kind not in self._graphs:
+            self._graphs[kind] = gaussian_graph(usable, rule)
         weights = None
         if rule.uses_contribution and count < usable.num_gaussians:
             detail = count if rule.uses_detail else None
@@ -176,4 +177,4 @@ class ViewerControls(torch.nn.Module):
                     raise ConfigError("there are no training views; open the run with ns-viewer, or take another rule")
                 self._contributions = {detail: self._contribute(viewer.pipeline.datamanager, detail)}
             weights = self._contributions[detail]
-        return prune_gaussians(gaussians, rule, count, weights, self._graphs.get(rule.edges))
+        return prune_gaussians(gaussians, rule, count, weights, self._graphs.get(kind))

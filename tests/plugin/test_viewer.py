@@ -144,6 +144,10 @@ def test_the_rules_of_the_menu_rank_by_what_they_say():
     for options in ({"keep_ratio": None, "max_bytes": 900}, {"mode": "continuous", "target_gaussians": 7}):
         mask = shown(build(start=20000, stop=20000, **options)[0], "as configured", 0.2)
         assert torch.equal(mask, masks["as configured"])
+    # A graph of half the neighbours, which is enough for pairs, does not serve other rules.
+    model, fresh = (build(selection="pairs", edges="centres")[0] for _ in range(2))
+    assert shown(model, "as configured", 0.2) is not None
+    assert torch.equal(shown(model, "band: high", 0.2), shown(fresh, "band: high", 0.2))
 
 
 @torch.no_grad()
