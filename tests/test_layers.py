@@ -21,10 +21,8 @@ BARE = {"nerfstudio": "plugin", "gsplat": "train"}
 """Packages that rooms below a floor never load; gsplat's rasteriser is loaded when a backend is asked for."""
 BUDGETS = ROOT / "tests" / "budgets.csv"
 """Lines of Python of each room, which may only fall: a feature pays its lines by removing as many."""
-SLACK = 20
-"""Lines that a room may lie below its budget before its number has to be lowered."""
-MAX_TWINS = 6
-"""File names that occur twice or more."""
+SLACK = 20  # Lines that a room may lie below its budget before its number has to be lowered
+MAX_TWINS = 6  # File names that occur twice or more
 LISTER = """
 import importlib, json, pkgutil, sys
 for floor in json.loads(sys.argv[1]):

@@ -8,8 +8,7 @@ NEVER = {"eval", "exec", "compile", "__import__", "os.system", "os.popen", "torc
 NEVER |= {"yaml.unsafe_load", "yaml.full_load", "yaml.load_all", "shelve.open", "shutil.unpack_archive"}
 READERS = {"pickle", "marshal", "dill", "cloudpickle", "joblib"}
 SAFE_LOADERS = {"_ConfigLoader", "_ValueLoader", "SafeLoader", "BaseLoader"}
-METHODS = {"extract", "extractall"}
-"""Of archives: nothing is unpacked to a disk."""
+METHODS = {"extract", "extractall"}  # Of archives: nothing is unpacked to a disk
 
 
 def dotted(node):

@@ -140,8 +140,7 @@ def _open_file(path: Path, scene: Scene, data: Path | None) -> Opened:
     manager = config.setup(device=model.device, test_mode="test", world_size=1, local_rank=0)
     source = stated if isinstance(stated := scene.meta.get("source"), dict) else {}
     method = str(source.get("method") or "sundae")
-    step = source.get("step")
-    steps = step + 1 if isinstance(step, int) else 0
+    steps = step + 1 if isinstance(step := source.get("step"), int) else 0
     return Opened(model, manager, path, data, method, path.name, steps, packed_bytes=path.stat().st_size)
 
 

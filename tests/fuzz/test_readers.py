@@ -209,8 +209,7 @@ def test_a_few_constant_planes_cannot_fill_the_memory(tmp_path):
 PLACES = ["../../outside", "/tmp/outside-of-sundae", "a/../../../outside", "..\\..\\outside", "~/outside", "$HOME/a"]
 ACTS = ("os.mkdir", "os.rename", "os.remove", "os.link", "os.symlink", "os.chmod", "os.system", "os.exec", "os.fork")
 ACTS += ("os.posix_spawn", "subprocess.Popen", "socket.connect", "socket.bind", "shutil.unpack_archive")
-recorded = []
-"""Acts since the last :func:`watched` began: an audit hook cannot be removed."""
+recorded = []  # Acts since the last :func:`watched` began: an audit hook cannot be removed
 
 
 def record(event, arguments):

@@ -34,10 +34,8 @@ class TinyRun(NamedTuple):
 
     scene: Path
     folder: Path
-    output: str
-    """What ns-train printed."""
-    points: int = 300
-    """Size of the sparse cloud."""
+    output: str  # What ns-train printed
+    points: int = 300  # Size of the sparse cloud
     prune_at: int = 45
     save_every: int = 30
     steps: int = 120

@@ -24,8 +24,7 @@ from sundae_ns.pruning.rule import kept_count
 from sundae_ns.scene.render import GaussianSource, render_view
 
 pytestmark = [pytest.mark.browser, needs_chromium]
-SIDE = 256
-"""Longer side of pictures after "Fast" has been pressed, pixels."""
+SIDE = 256  # Longer side of pictures after "Fast" has been pressed, pixels
 FAR = 48
 MEAN, SHARE = 3.0, 0.02
 """Bounds of the mean difference of screenshot and render, in steps of 255, and of the share of pixels off by FAR."""

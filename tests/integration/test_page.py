@@ -33,12 +33,9 @@ from sundae_ns.scene.page import page_of, write_page
 pytestmark = [pytest.mark.browser, needs_chromium]
 image, psnr, truths = bench_page.image, bench_page.psnr, bench_page.truths
 
-LEAST = 57.0
-"""Lowest PSNR of an image of the page against Python's; the worst is 58.7."""
-LEAST_HALF = 55.0
-"""The same with the head in half precision; the worst is 57.6."""
-SECONDS = 180.0
-"""Shaders compile in software."""
+LEAST = 57.0  # Lowest PSNR of an image of the page against Python's; the worst is 58.7
+LEAST_HALF = 55.0  # The same with the head in half precision; the worst is 57.6
+SECONDS = 180.0  # Shaders compile in software
 SIZE = (160, 120)
 WEBGL = ["--disable-features=WebGPU"]  # flags for a browser without WebGPU
 TICKING = """

@@ -322,8 +322,7 @@ def test_what_cannot_be_recorded_runs_as_before_under_every_default_dtype(traine
 
 SPREAD = 1.0
 """dB between two runs of one seed: CUDA sums in no fixed order; five such runs had a standard deviation of 0.2 dB."""
-ROOM = 256 << 20
-"""Bytes that training may take beyond what it has when it starts."""
+ROOM = 256 << 20  # Bytes that training may take beyond what it has when it starts
 
 
 @pytest.fixture

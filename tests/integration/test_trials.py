@@ -23,10 +23,8 @@ from sundae_ns.train.choice import HeldOutQuality
 from sundae_ns.train.curve import read_count_curve
 from sundae_ns.train.pruning import PruningConfig
 
-VIEWS = 40
-"""Of a run that decides its count; one that decides its head alone has 16."""
-WINDOW = 2
-"""Steps of a trial of a count, and between two measurements of a length: a fiftieth of so short a run."""
+VIEWS = 40  # Of a run that decides its count; one that decides its head alone has 16
+WINDOW = 2  # Steps of a trial of a count, and between two measurements of a length: a fiftieth of so short a run
 
 
 @pytest.fixture(scope="module")
@@ -374,8 +372,7 @@ def test_several_gpus_train_the_head_without_trials(make, judge_heads):
     assert deciding.kept == {}
 
 
-DECIDED = PRUNE_AT + 2 * LENGTH
-"""Step of the decision about the length, after trials of no head and of a head."""
+DECIDED = PRUNE_AT + 2 * LENGTH  # Step of the decision about the length, after trials of no head and of a head
 
 
 @pytest.fixture

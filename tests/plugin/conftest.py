@@ -14,8 +14,7 @@ from harness.still_life import write_still_life
 from sundae_ns.plugin.datamanager import SundaeDatamanagerConfig
 
 RANKS = 2
-LIMIT = 600
-"""Seconds that a program may take on a busy machine."""
+LIMIT = 600  # Seconds that a program may take on a busy machine
 
 
 @pytest.fixture(scope="session")

@@ -23,8 +23,7 @@ from sundae_ns.plugin.finished_runs import datamanager_of, describe_capture
 from sundae_ns.scene.cameras import cameras_of
 from sundae_ns.scene.scene import Scene
 
-SURVEY = np.array([431_250.25, 5_412_330.5, 212.125])
-"""Coordinates of a place in UTM, metres."""
+SURVEY = np.array([431_250.25, 5_412_330.5, 212.125])  # Coordinates of a place in UTM, metres
 
 
 def said(capsys):

@@ -19,8 +19,7 @@ from sundae_ns.plugin.dataparsers import check_projection
 from sundae_ns.scene.cameras import cameras_of
 
 CENTRE = [12.0, 12.0]
-FOCAL = 15.0
-"""Of a round lens that sees 92 degrees across 24 px."""
+FOCAL = 15.0  # Of a round lens that sees 92 degrees across 24 px
 
 
 def images_of(made):

@@ -96,8 +96,7 @@ def test_other_checkpoints_are_refused_and_nothing_changes(build, options, cause
     assert all(torch.equal(value, before[name]) for name, value in model.named_parameters())
 
 
-N = 60
-"""Gaussians of a model that is built without a count."""
+N = 60  # Gaussians of a model that is built without a count
 
 
 GROWTH = {"warmup_length": 0, "refine_every": 3, "reset_alpha_every": 100, "densify_grad_thresh": 1e-9}

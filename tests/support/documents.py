@@ -7,8 +7,7 @@ from functools import reduce
 from operator import getitem
 from typing import Any
 
-GONE = object()
-"""Value of what is removed."""
+GONE = object()  # Value of what is removed
 
 
 def put(document: Any, changes: Mapping[str, Any]) -> None:

@@ -4,8 +4,7 @@ import math
 
 import torch
 
-NEAR = 2.0**-6
-"""A float32 number, so that a Gaussian can lie on the plane in both precisions."""
+NEAR = 2.0**-6  # A float32 number, so that a Gaussian can lie on the plane in both precisions
 
 
 def scene(n=300, seed=0):

@@ -14,8 +14,7 @@ from av.error import FFmpegError
 
 from sundae_ns.core.errors import DataError, SundaeError
 
-SECONDS = 5
-"""Limit of one case, in CPU time, so that other work on the machine does not count."""
+SECONDS = 5  # Limit of one case, in CPU time, so that other work on the machine does not count
 BASE, FACTOR = 300 << 20, 20
 """Limit of one case: BASE bytes plus FACTOR bytes per byte of input."""
 

@@ -65,8 +65,7 @@ class FakeDatamanager:
     held_out_indices = ()
     train_indices = (0, 1, 2)
 
-    mask = None
-    """Of each view."""
+    mask = None  # Of each view
 
     @property
     def cached_train(self):

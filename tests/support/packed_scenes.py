@@ -38,11 +38,9 @@ class Kind:
     antialiased: bool = False
     background: Background = "random"
     head: HeadConfig | None = None
-    focal: float | None = FOCAL
-    """Focal length that the head was trained at; None if unknown."""
+    focal: float | None = FOCAL  # Focal length that the head was trained at; None if unknown
     config: PackConfig | None = None
-    measured: bool = False
-    """Whether steps follow a sensitivity, a random one here."""
+    measured: bool = False  # Whether steps follow a sensitivity, a random one here
 
 
 def _head(mode: str, fold: int, features: int, size: str = "tiny") -> HeadConfig:

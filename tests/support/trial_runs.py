@@ -19,8 +19,7 @@ from harness.still_life import write_still_life
 from sundae_ns.method_configs import sundae
 
 STEPS, PRUNE_AT = 100, 40
-LENGTH = 5
-"""Steps of a trial: a twentieth of so short a run. Views are held out from step 30 on."""
+LENGTH = 5  # Steps of a trial: a twentieth of so short a run. Views are held out from step 30 on.
 
 
 def tiny_scene(folder: Path, cameras: int) -> Path:
