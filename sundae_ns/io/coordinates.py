@@ -146,7 +146,9 @@ def scene_order(means: NDArray[np.float32]) -> tuple[NDArray[np.int64], int]:
     do not push all others into one cell. Far ones, beyond 30 times the spread, come by powers of two of the distance.
     """
     centred = means.astype(np.float64) - np.median(means, axis=0)
-    centred /= np.median(np.abs(centred)) or np.abs(centred).mean() or 1.0
+    reach = np.abs(centred)
+    # Of a street, two coordinates of three are small: those along it are not far away.
+    centred /= max(np.median(reach), np.median(reach.max(axis=1)) / 8) or reach.mean() or 1.0
     bent = np.arcsinh(centred)
     low, extent = bent.min(axis=0), np.ptp(bent, axis=0).max() or 1.0
     shells = np.ceil(np.log2((np.abs(centred).max(axis=1) / 30).clip(min=1)))
