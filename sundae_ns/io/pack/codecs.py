@@ -367,8 +367,7 @@ class Codecs:
             if isinstance(codec, Transform):
                 codecs[name] = codec.with_step(step, as_matrix(gaussians[name]))
         config = replace(config, position_bits=self.config.position_bits, block=self.config.block)
-        of_head = None if self.head is None else self.head.scaled(ratios["head_step"], head)
-        return Codecs(config, self.blocks, codecs, of_head)
+        return Codecs(config, self.blocks, codecs, self.head and self.head.scaled(ratios["head_step"], head))
 
     @torch.no_grad()
     def rounded(self, gaussians: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -386,8 +385,7 @@ def fit_codecs(
     gaussians: Mapping[str, Tensor], head: Mapping[str, Tensor], config: PackConfig, sensitivity: Sensitivity
 ) -> tuple[dict[str, Tensor], Codecs]:
     """Gaussians in the stored order, with rounded positions, and codecs fitted to them and to a head; {} for none."""
-    names = [name for name in (*SPLAT_NAMES, FEATURES) if name in gaussians]
-    values = {name: as_matrix(gaussians[name]) for name in names}
+    values = {name: as_matrix(gaussians[name]) for name in (*SPLAT_NAMES, FEATURES) if name in gaussians}
     order, near = scene_order(values["means"])
     filled = min(range(config.block, max(config.block // 2, 15), -1), key=lambda size: max(near % size, 16))
     widths = np.exp(values["scales"].max(axis=1).clip(max=80))
@@ -410,7 +408,7 @@ def fit_codecs(
             form = sensitivity.rows.get(name)
             step = getattr(config, option)
             codecs[name] = fit_transform(values[name], step, centred=name != "features_rest", form=form)
-    ordered = {name: torch.from_numpy(values[name]).reshape(gaussians[name].shape) for name in names}
+    ordered = {name: torch.from_numpy(values[name]).reshape(gaussians[name].shape) for name in values}
     return ordered, Codecs(config, blocks, codecs, _fit_head(head, config.head_step, sensitivity.head))
 
 
