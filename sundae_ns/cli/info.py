@@ -38,7 +38,7 @@ def info(scene: Scene, cameras: File = None, json: Flag = False) -> int:
 
 def _words(value: Any) -> str:
     if isinstance(value, list):
-        return " ".join(f"{number:.6g}" for number in value)
+        return " ".join(f"{number:.{6 if abs(number) < 1e5 else 10}g}" for number in value)
     if isinstance(value, bool):
         return "yes" if value else "no"
     return f"{value:,}" if isinstance(value, int) else str(value or "-")

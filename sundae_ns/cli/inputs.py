@@ -17,7 +17,7 @@ from rich.console import Console
 from torch import Tensor
 
 from sundae_ns.cli.options import SceneDetails, Wishes
-from sundae_ns.cli.refusals import check_file
+from sundae_ns.cli.refusals import check_file, check_suffix
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import ConfigError, DataError, SundaeError
 from sundae_ns.core.files import write_bytes
@@ -189,6 +189,7 @@ def opened(source: Path, wishes: Wishes, details: SceneDetails, *, capture: bool
     if details.preview is not None:
         if wishes.remove_floaters is None:
             raise ConfigError("--preview shows what --remove-floaters changes; add it")
+        check_suffix(details.preview, (".png",))
         check_file(details.preview, reads=[source, details.cameras], overwrite=details.overwrite)
     if is_run(source) and (capture or wishes.remove_floaters is not None or details.data is not None):
         scene, rows = open_run(source, max_cameras=most, data=details.data), None

@@ -195,9 +195,8 @@ def crop_mask(scene: Scene, low: AnyArray, high: AnyArray) -> Tensor:
         raise ConfigError("the box is empty; give its lowest x y z first, then its highest")
     inside = ((means >= lowest) & (means <= highest)).all(dim=1)
     if not bool(inside.any()):
-        digits = 3 if scene.offset is None else 10
         ends = np.quantile(means.cpu().numpy(), (0.05, 0.95), axis=0)
-        corners = (" ".join(f"{value:.{digits}g}" for value in corner) for corner in ends)
+        corners = (" ".join(f"{value:.{3 if scene.offset is None else 10}g}" for value in corner) for corner in ends)
         raise DataError(f"no Gaussian is in the box; most of them lie between {' and '.join(corners)}")
     return inside
 

@@ -15,7 +15,7 @@ from rich.console import Console
 from torch import Tensor
 
 from sundae_ns.core.camera import Camera
-from sundae_ns.core.files import replacing
+from sundae_ns.core.files import write_image
 from sundae_ns.core.gaussians import bytes_of
 from sundae_ns.head.head import bytes_of_module
 from sundae_ns.io.config_file import find_config
@@ -46,8 +46,7 @@ def write_preview(path: Path, before: Scene, after: Scene, cameras: Sequence[Cam
     """Write images of two scenes, side by side, as a PNG: of the held-out camera in which they differ most."""
     pairs = [[render(scene, view).rgb for scene in (before, after)] for view in held_out_cameras(before, cameras)]
     most = max(pairs, key=lambda pair: float((pair[0] - pair[1]).square().mean()))
-    with replacing(path) as partial:
-        image_of(torch.cat(most, dim=1)).save(partial, "png")
+    write_image(path, image_of(torch.cat(most, dim=1)))
 
 
 def bytes_at(path: Path) -> int | None:
@@ -62,14 +61,15 @@ def bytes_at(path: Path) -> int | None:
 def describe(
     scene: Scene, path: Path, cameras: Sequence[Camera] = (), *, console: Console | None = None
 ) -> dict[str, Any]:
-    """Facts of a scene that was loaded from a path, as plain values for JSON; lengths are in units of the scene.
+    """Facts of a scene that was loaded from a path, as plain values for JSON; coordinates are those of its file.
 
     ``invisible`` is the share of the Gaussians that no camera sees, ``floaters`` how many a cleaning would remove, and
     ``crop`` a box, lowest corner first, of 99% of what they see. Cameras are by default the stored, else virtual ones.
     """
     cameras = cameras or scene.cameras
     views = for_cleaning(cameras) or virtual_cameras(scene, LOOKING)
-    weights, means = weights_in(scene, views, console=console), scene.means.double()
+    weights = weights_in(scene, views, console=console)
+    means = scene.means + scene.means.new_tensor(scene.offset or (0.0, 0.0, 0.0), dtype=torch.float64)
     end = 1 << 16 if path.is_file() and kind_of(path) != "sog" else None  # a .sog holds its meta.json anywhere
     stated = _PRODUCER.search(path.read_bytes()[:end] if path.is_file() else b"")
     return {

@@ -46,7 +46,7 @@ def page(scenes: Scene | Mapping[str, Scene], path: Path | str, *, views: Mappin
             *Copy link* gives. *Play* leads through them.
 
     Raises:
-        ConfigError: there is no such view, or there are more than two scenes.
+        ConfigError: there is no such view, there are more than two scenes, or the path has another suffix.
         PackError, StorageError: the format cannot store a scene; the disk is full or not writable.
 
     >>> import pathlib, tempfile, torch, sundae_ns as sn
@@ -55,6 +55,8 @@ def page(scenes: Scene | Mapping[str, Scene], path: Path | str, *, views: Mappin
     >>> sn.page({"before": scene, "after": scene[:25]}, path, views={"Front": 0})
     """
     named = {Path(path).resolve().stem: scenes} if isinstance(scenes, Scene) else dict(scenes)
+    if Path(path).suffix.lower() not in ("", ".html"):
+        raise ConfigError(f"{path} is no page; name it .html, or a folder without a suffix")
     write_page(Path(path), *(shown_as(name, scene) for name, scene in named.items()), views=views)
 
 
@@ -128,13 +130,12 @@ def link_of(view: View, scene: Scene, name: str) -> str:
 
 def _poster(scene: Scene) -> str:
     """Data address of the first image; of an empty one if it cannot be rendered."""
+    content = io.BytesIO()
     try:
-        image = render_first(scene)
+        render_first(scene).save(content, "jpeg", quality=80)
     except MemoryExhaustedError as error:
         _log.warning("the page has no first image: %s", error)
         return "data:image/gif;base64,R0lGODlhAQABAIAAAAAAAP///yH5BAEAAAAALAAAAAABAAEAAAIBRAA7"  # a transparent pixel
-    content = io.BytesIO()
-    image.save(content, "jpeg", quality=80)
     return f"data:image/jpeg;base64,{base64.b64encode(content.getvalue()).decode()}"
 
 

@@ -105,14 +105,17 @@ def test_info_says_what_a_file_holds(folder, capsys):
     assert sum(facts["bytes_by_attribute"].values()) == bytes_of(scene.gaussians)
     assert facts["low"] == pytest.approx(scene.gaussians["means"].amin(dim=0).tolist())
     assert 0 <= facts["invisible"] < 0.5
-    assert run("info", folder / "whole.sundae") == 0
-    said, warned = capsys.readouterr()
-    assert "invisible             0.0% of the Gaussians, to 3 cameras" in said
-    assert not warned, "a bar leaves no line where stderr is no terminal"
-    box = said.partition("--crop ")[2].split()[:6]
-    assert run("export", folder / "whole.sundae", "-o", folder / "cut.spz", "--crop", *box) == 0
-    assert sn.load(folder / "cut.spz").num_gaussians > 290
-    capsys.readouterr()
+    frame = {"transform": [[1, 0, 0, -4e6], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": 1.0}
+    sn.save(dataclasses.replace(scene, meta={"frame": frame}), folder / "survey.ply")
+    for name, seen_by in (("whole.sundae", "3 cameras"), ("survey.ply", "64 virtual cameras")):
+        assert run("info", folder / name) == 0
+        said, warned = capsys.readouterr()
+        assert f"invisible             0.0% of the Gaussians, to {seen_by}" in said
+        assert not warned, "a bar leaves no line where stderr is no terminal"
+        box = said.partition("--crop ")[2].split()[:6]
+        assert run("export", folder / name, "-o", folder / "cut.spz", "--crop", *box, "--overwrite") == 0
+        assert sn.load(folder / "cut.spz").num_gaussians > 290
+        capsys.readouterr()
     assert "nothing.ply cannot be read" in refusal(capsys, "info", folder / "nothing.ply")
 
 

@@ -156,6 +156,7 @@ REFUSED = {
     "no view": (lambda: sn.measure(SCENE, SCENE), "no view to measure in"),
     "no link": (lambda: sn.page(SCENE, "a.html", views={"a": "x"}), "view 'a' is 'x'; give a camera"),
     "no stop": (lambda: sn.page(SCENE, "a.html", views={"a": 1}), "an index below 1"),
+    "no page": (lambda: sn.page(SCENE, "a.ply"), "a.ply is no page; name it .html"),
     "three": (lambda: sn.page({"a": SCENE, "b": SCENE, "c": SCENE}, "a.html"), "a page of 3 scenes"),
     "height": (lambda: sn.show(SCENE, height="400"), "height is '400'"),
     "half": (lambda: sn.prune(SCENE, count=0.5), "count is 0.5"),
