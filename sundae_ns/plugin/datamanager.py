@@ -245,7 +245,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         if split == "train" and self.eval_dataset:
             self.eval_dataset.check_images()  # report a damaged test view now, not at the prune
         device, cameras = torch.device(self.device), dataset.cameras
-        size = 3 * int((cameras.width * cameras.height).sum())
+        size = {"uint8": 3, "float32": 12}[self.config.cache_images_type] * int((cameras.width * cameras.height).sum())
         full = device.type == "cuda" and size > torch.cuda.mem_get_info(device)[0] / 2
         if cache_images_device == "cpu" and not torch.cuda.is_available():
             # The stock "cpu" cache pins memory, which needs a driver; "gpu" means the model's device.

@@ -115,12 +115,13 @@ def test_images_that_do_not_fit_on_the_gpu_stay_in_main_memory(still_life, load,
 
     monkeypatch.setattr(FullImageDatamanager, "_load_images", cached)
     made = load(still_life)
-    size = 3 * VIEWS * SIDE * SIDE
+    least = 2 * 3 * VIEWS * SIDE * SIDE
     made.device = torch.device("cuda")
-    for free in (2 * size, 2 * size - 1):
-        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _, free=free: (free, 10 * size))
+    for kind, free in (("uint8", least), ("uint8", least - 1), ("float32", 4 * least - 1)):
+        made.config.cache_images_type = kind
+        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _, free=free: (free, 10 * least))
         made._load_images("train", "gpu")
-    assert places == ["gpu", "cpu"]
+    assert places == ["gpu", "cpu", "cpu"]
     assert "the train images need more than half of the free GPU memory" in " ".join(capsys.readouterr().out.split())
 
 

@@ -97,8 +97,6 @@ def test_other_checkpoints_are_refused_and_nothing_changes(build, options, cause
 
 
 N = 60  # Gaussians of a model that is built without a count
-
-
 GROWTH = {"warmup_length": 0, "refine_every": 3, "reset_alpha_every": 100, "densify_grad_thresh": 1e-9}
 """A step of growth every third step."""
 
