@@ -221,11 +221,6 @@ def with_head(curve: Sequence[CurvePoint], gain: HeadGain) -> list[CurvePoint]:
     return [replace(point, psnr_loss=point.psnr_loss - psnr, ssim_loss=point.ssim_loss - ssim) for point in points]
 
 
-def excess(point: CurvePoint, tolerance: Tolerance) -> float:
-    """The larger of both losses in units of its tolerance; at most 1 is as good as the best."""
-    return max(point.psnr_loss / tolerance.psnr, point.ssim_loss / tolerance.ssim)
-
-
 def is_lost(point: CurvePoint, tolerance: Tolerance) -> bool:
     """Whether the count is clearly too small, so that fewer need not be tried."""
     psnr = point.psnr_loss - 2 * point.psnr_error > LOST * tolerance.psnr
@@ -238,7 +233,8 @@ def choose(curve: Sequence[CurvePoint], tolerance: Tolerance) -> int:
     Between the smallest tried count that is and the next smaller one, the loss is interpolated over the logarithm of
     the count. If PSNR and SSIM ask for different counts, the one that loses least, in tolerances, is taken.
     """
-    over = [excess(point, tolerance) for point in curve]
+    # The larger of both losses in units of its tolerance; at most 1 is as good as the best.
+    over = [max(point.psnr_loss / tolerance.psnr, point.ssim_loss / tolerance.ssim) for point in curve]
     if not (good := [index for index, value in enumerate(over) if value <= 1]):
         return curve[over.index(min(over))].count
     index = good[-1]

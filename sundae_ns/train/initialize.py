@@ -136,10 +136,10 @@ class DenseStart(Callback):
         sparse, colours = self._points
         self._points = None
         state = run.state
-        too_many = state.device.type == "cpu" and len(run.view_indices()) > MOST_ON_CPU
-        if too_many or len(sparse) >= by_device(FILLED, state.device):
-            return
         most = by_device(FILLED, state.device) - len(sparse)
+        too_slow = state.device.type == "cpu" and len(run.view_indices()) > MOST_ON_CPU
+        if too_slow or most <= 0:
+            return
         on_device = sparse.to(state.device)
         with torch.no_grad():
             sweep = Sweep(run.photos(), on_device[on_device.isfinite().all(dim=1)], by_device(SIDES, state.device))

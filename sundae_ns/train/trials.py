@@ -240,8 +240,6 @@ class Trials(Callback):
         progress, state = self.progress, run.state
         indices = run.view_indices()
         num_views = len(indices)
-        several = run.images_per_step > 1
-        max_bytes = self.config.max_bytes or math.inf
         # A warm start skips the steps before the prune.
         progress.steps = progress.steps or (run.schedule_length or 0) + state.offset
         self._window = max(round(COUNT_SHARE * progress.steps), 1)
@@ -249,38 +247,49 @@ class Trials(Callback):
         self._judges = choice.spread_cameras(indices, min(choice.MOST_HELD_OUT, num_views // choice.HELD_OUT_EVERY), 0)
         state.pruning[VIEWS] = num_views
         if self.config.decides and "count" not in progress.chosen:
-            steps = len(SHARES) * self._window + (2 * self._length if self.decides_head else 0)
-            left = _steps_of(run) - self.config.prune_at
-            obstacles = {
-                f"{num_views} training views are too few to compare counts": num_views < MANY_VIEWS,
-                "trials of counts need a single GPU": several,
-                "a warm start has seen all training views before": state.offset > 0,
-                "the steps after the prune are too few to compare counts": steps > MOST_TRIALS * left,
-            }
-            reason = next((reason for reason, holds in obstacles.items() if holds), None)
-            if state.pruning["num_prunes"] and not progress.stage:  # by a share that was given
-                progress.chosen["count"] = 0
-            elif reason is not None:
-                if progress.stage:  # one GPU has begun them, and has pruned for a trial
-                    self.go_back("start", state)
-                self._keep_usual(run, reason)
-            else:
-                self.coming["count"] = self._judges
+            self._prepare_counts(run, num_views)
         if self.decides_head and "head" not in progress.chosen:
-            if several:  # also if one GPU has begun them: its copies are of all Gaussians
-                wide = state.head is not None and state.head.config.num_features == MORE_FEATURES
-                self._finish_with(run, "features" if wide else "head", "trials need a single GPU")
-            elif state.head is not None and stored_bytes({}, state.head.config) >= LARGEST_HEAD * max_bytes:
-                self._finish_with(run, "plain", "in a pack it would take a quarter of pruning.max-bytes")
-            elif num_views < FEWEST_VIEWS:
-                self._finish_with(run, "plain", f"{num_views} training views are too few to tell whether a head helps")
-            elif progress.stage != "head" and "head" not in self.coming and not self._heads_fit(run):
-                if run.last_step is not None:
-                    _log.warning("training ends before the head can be tried, %s", _DISABLED)
-        elif several and progress.stage in ("length", "repeat", "paused"):  # a length counts steps of one image
-            self._end_length(run, "", None)
+            self._prepare_heads(run, num_views)
+        elif run.images_per_step > 1 and progress.stage in ("length", "repeat", "paused"):
+            self._end_length(run, "", None)  # a length counts steps of one image
         self.hold_out(run)
         self._record(run)
+
+    def _prepare_counts(self, run: TrainingRun, num_views: int) -> None:
+        """Hold views out for trials of counts, or keep the usual share where there can be none."""
+        progress, state = self.progress, run.state
+        steps = len(SHARES) * self._window + (2 * self._length if self.decides_head else 0)
+        left = _steps_of(run) - self.config.prune_at
+        obstacles = {
+            f"{num_views} training views are too few to compare counts": num_views < MANY_VIEWS,
+            "trials of counts need a single GPU": run.images_per_step > 1,
+            "a warm start has seen all training views before": state.offset > 0,
+            "the steps after the prune are too few to compare counts": steps > MOST_TRIALS * left,
+        }
+        reason = next((reason for reason, holds in obstacles.items() if holds), None)
+        if state.pruning["num_prunes"] and not progress.stage:  # by a share that was given
+            progress.chosen["count"] = 0
+        elif reason is not None:
+            if progress.stage:  # one GPU has begun them, and has pruned for a trial
+                self.go_back("start", state)
+            self._keep_usual(run, reason)
+        else:
+            self.coming["count"] = self._judges
+
+    def _prepare_heads(self, run: TrainingRun, num_views: int) -> None:
+        """Decide about the head where trials cannot, or warn if training ends before them."""
+        progress, head = self.progress, run.state.head
+        largest = LARGEST_HEAD * (self.config.max_bytes or math.inf)
+        if run.images_per_step > 1:  # also if one GPU has begun them: its copies are of all Gaussians
+            wide = head is not None and head.config.num_features == MORE_FEATURES
+            self._finish_with(run, "features" if wide else "head", "trials need a single GPU")
+        elif head is not None and stored_bytes({}, head.config) >= largest:
+            self._finish_with(run, "plain", "in a pack it would take a quarter of pruning.max-bytes")
+        elif num_views < FEWEST_VIEWS:
+            self._finish_with(run, "plain", f"{num_views} training views are too few to tell whether a head helps")
+        elif progress.stage != "head" and "head" not in self.coming and not self._heads_fit(run):
+            if run.last_step is not None:
+                _log.warning("training ends before the head can be tried, %s", _DISABLED)
 
     def after_step(self, run: TrainingRun) -> None:
         """Try counts, before the schedule prunes."""
@@ -349,7 +358,7 @@ class Trials(Callback):
         coming = {view for views in self.coming.values() for view in views}
         run.hold_out(sorted(coming) if self.trial is None else self.trial.held_out)
 
-    def ended(self, run: TrainingRun) -> bool:
+    def advance(self, run: TrainingRun) -> bool:
         """Average the weights if it is due; returns whether the current trial has ended."""
         trial, state = self.trial, run.state
         assert trial is not None
@@ -389,7 +398,7 @@ class Trials(Callback):
     def _go_on(self, run: TrainingRun) -> None:
         """Once the current trial has ended, measure it; try the next candidate of the stage, or choose."""
         progress, state, stage = self.progress, run.state, self.progress.stage
-        if not self.ended(run):
+        if not self.advance(run):
             return
         if stage == "repeat":
             self._mean.replace(weights_of(state))  # the mean of the last window stays to the end of the schedule

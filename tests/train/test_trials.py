@@ -40,7 +40,7 @@ class FakeRun:
         for number in range(1, most + 1):
             self.state.step += 1
             self.state.gaussians["means"].data += 1
-            if trials.ended(self):
+            if trials.advance(self):
                 return number
         return most
 
