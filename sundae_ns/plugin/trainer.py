@@ -265,8 +265,8 @@ class SundaeTrainer(Trainer):
             CONSOLE.print(NOTHING_SAVED)
         else:
             self.save_checkpoint(self.step)  # ranks leave after it, because one that leaves ends the others
-            data = self.config.pipeline.datamanager.data
-            command = resume_command(sys.argv, self.checkpoint_dir, str(self.config.method_name), data)
+            data, left = self.config.pipeline.datamanager.data, self.last_step - self.step
+            command = resume_command(sys.argv, self.checkpoint_dir, str(self.config.method_name), data, left)
             CONSOLE.print("Stopped and saved. To train the remaining steps:")
             CONSOLE.print(f"    {command}", markup=False, highlight=False, soft_wrap=True)
         profiler.PROFILER.clear()  # else nerfstudio's table would hide the command

@@ -142,21 +142,23 @@ class Interruption:
             os.write(2, b"" if self._quiet else text.encode())  # a handler may interrupt a print
 
 
-def resume_command(program: Sequence[str], folder: Path, method: str, data: object) -> str:
-    """The command that trains the remaining steps of the run whose checkpoints lie in a folder.
+def resume_command(program: Sequence[str], folder: Path, method: str, data: object, left: int) -> str:
+    """The command that trains the ``left`` steps of the run whose checkpoints lie in a folder.
 
-    It follows the command line that started the run, if that was ``ns-train``'s.
+    It follows the command line that started the run, if that was ``ns-train``'s. Steps that it stated may be fewer than
+    the schedule has; else the schedule says how many are left.
     """
     if Path(program[0]).name != "ns-train" or len(program) < 2:
         return shlex.join(["ns-train", method, "--data", str(data), "--load-dir", str(folder)])
-    words, skip = [], False
+    words, length, skip = [], list[str](), False
     for word in program[2:]:
         option = word[2:].partition("=")[0].replace("-", "_") if word.startswith("--") else None
         if option in _REPLACED:
             skip = "=" not in word
+            length = ["--max-num-iterations", str(left)] if option == "max_num_iterations" else length
         elif skip:
             skip = False
         else:
             words.append(word)
     # Before the rest, which may end in a subcommand of the data parser.
-    return shlex.join(["ns-train", program[1], "--load-dir", str(folder), *words])
+    return shlex.join(["ns-train", program[1], "--load-dir", str(folder), *length, *words])

@@ -112,15 +112,15 @@ def test_a_second_one_leaves_at_once():
 @pytest.mark.parametrize(
     ("started", "expected"),
     [
-        ("sundae --data a --max-num-iterations 9", "sundae --load-dir 'a run' --data a"),
-        ("sundae --max-num-iterations=9 --vis viewer", "sundae --load-dir 'a run' --vis viewer"),
+        ("sundae --data a --max-num-iterations 9", "sundae --load-dir 'a run' --max-num-iterations 4 --data a"),
+        ("sundae --max-num-iterations=9 --vis x", "sundae --load-dir 'a run' --max-num-iterations 4 --vis x"),
         ("sundae-1 --load-dir old --load-step 4 colmap --a s", "sundae-1 --load-dir 'a run' colmap --a s"),
         ("", "sundae --data data --load-dir 'a run'"),  # by another program
     ],
 )
 def test_the_command_that_resumes(started, expected):
     program = ["/usr/bin/ns-train", *started.split()] if started else ["pytest", "--load-dir", "x"]
-    assert resume_command(program, Path("a run"), "sundae", "data") == f"ns-train {expected}"
+    assert resume_command(program, Path("a run"), "sundae", "data", 4) == f"ns-train {expected}"
 
 
 @pytest.mark.parametrize(
