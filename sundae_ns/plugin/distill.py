@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast
+from zlib import crc32
 
 import torch
 from pytorch_msssim import SSIM
@@ -81,15 +82,15 @@ class Distillation:
         self.steps, self._seed = steps, seed  # Number of steps to train
         scored_by = self.cameras[: by_device(VIEWS, teacher.device)]
         cut = prune_with_mask(self._teacher, keep, count, scored_by, None, progress=progress, fit=False)
-        config = SundaeModelConfig(prior_after_prune=0.0, background_color=teacher.background_color)
         tiny = {"size": "tiny", "pixel_unshuffle": 1, "num_features": 5} if teacher.device.type == "cpu" else {}
         self.state = self._start(cut.scene.gaussians, HeadConfig(mode="residual", **cast(Any, tiny)) if head else None)
         counts = [self._teacher.num_gaussians, self.state.gaussians.num_gaussians, len(self.cameras)]
-        self._options = {"steps": steps, "seed": seed, "counts": counts}  # What a resumed training must share
+        of_scene = crc32(scene.gaussians["means"].detach().cpu().numpy().tobytes())
+        self._options = {"steps": steps, "seed": seed, "counts": counts, "scene": of_scene}  # As a resumed one has them
         self.step = 0  # Number of steps that were trained
         self.gain: float | None = None  # PSNR that the head gained in its trial, dB; None before it, and without one
         self._mean = RunningMean()
-        self._losses = StepLosses(config, SSIM(data_range=1.0, size_average=True, channel=3), 0)
+        self._losses = StepLosses(SundaeModelConfig(prior_after_prune=0.0), SSIM(data_range=1.0, channel=3), 0)
         self._settings = self._teacher.settings(head=False)
         self._recorded = RecordedStep(self._losses) if self._settings.backend.name == "gsplat" else None
 
@@ -244,7 +245,7 @@ class Distillation:
         with reading(path, "a checkpoint of this scene and options", CheckpointError, remedy="remove it to start anew"):
             saved = torch.load(path, map_location=state.device, weights_only=True)
             if saved["options"] != self._options:
-                raise ValueError("other options")
+                raise ValueError("other options or another scene")
             self.step = int(saved["step"])
             self.gain = saved["gain"]
             if not any(name.startswith("networks.") for name in saved["model"]):
