@@ -270,13 +270,12 @@ class Search:
 
 def best_pack(searches: Sequence[Search], most_drop: float) -> Candidate:
     """The smallest pack that loses at most ``most_drop`` dB, of searches of one run; ``ConfigError`` if none does."""
-    packs = list[Candidate]()
-    failure = ConfigError("there is no pack")
+    packs, failures = list[Candidate](), list[ConfigError]()
     for search in reversed(searches):
         try:
             packs.append(search.better_than(most_drop))
         except ConfigError as error:
-            failure = error
+            failures.append(error)
     if not packs:
-        raise failure
+        raise failures[-1]
     return min(packs, key=lambda pack: pack.bytes)

@@ -29,7 +29,6 @@ from sundae_ns.train.exposure import ExposureCompensation
 from sundae_ns.train.state import Callback, TrainingState
 
 REFERENCE = select_backend("reference", "cpu")
-COLORS = RenderSettings(REFERENCE)
 N, RANKS = 90, 2
 
 
@@ -54,7 +53,7 @@ def camera(rank, *, behind=False):
 
 
 def draw(source, camera):
-    params = source.primitives(camera, COLORS, features=True)
+    params = source.primitives(camera, RenderSettings(REFERENCE), features=True)
     shapes = params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid().squeeze(-1)
     colors = torch.cat([params["colors"], params["features"]], dim=1)
     shown = rasterize(Inputs(*shapes, colors, camera, absgrad=True, render_depth=True), backend=REFERENCE)
