@@ -54,7 +54,7 @@ def prune(
     to the scene's own images. On a CPU half a million Gaussians with three bands of harmonics take about 2.2 GB.
 
     Args:
-        out: file to write, by its suffix .ply, .spz, .sog, .glb, .sundae or .html; a .ply of a binary one keeps all columns.
+        out: result, by its suffix .ply, .spz, .sog, .glb, .sundae or .html; a .ply of a binary one keeps all columns.
         target_drop: keep as few as lose at most this PSNR, in dB, of a full scene that shows its photos at 30 dB; by
             the images of held-out cameras.
         distill: train what is kept on the full scene's images, from cameras near the scene's or virtual ones, with a
