@@ -152,18 +152,18 @@ class Project:
         begun = self.out.is_dir() and all(name.startswith((LOCK, SETTINGS)) for name in os.listdir(self.out))
         check_folder(self.out, reads=[self.photos], outside=self.photos, overwrite=begun or path.is_file() or None)
         reserve(self.out, "works in {}; wait for it, or choose another folder")
-        if not path.is_file():
-            write_text(path, json.dumps(settings, indent=1) + "\n")
-            return
+        # Only the pack reads these, and refuses a wrong one after the whole training.
+        free = () if (self.out / "scene.sundae").is_file() else ("up", "start_view")
         try:
-            before = json.loads(path.read_bytes())
-            changed = [(name, before[name], now) for name, now in settings.items() if before[name] != now]
+            before = json.loads(path.read_bytes()) if path.is_file() else settings
+            changed = [name for name, now in settings.items() if before[name] != now and name not in free]
         except (ValueError, TypeError, KeyError, RecursionError) as error:
             raise StorageError(f"{path} is damaged; choose another folder") from error
-        for name, *values in changed:
-            first, now = ("left out" if value is None else value for value in values)
+        for name in changed:
+            first, now = ("left out" if each[name] is None else each[name] for each in (before, settings))
             made = f"{self.out} was made with {name.replace('_', '-')} {first}, not {now}"
             raise ConfigError(f"{made}; repeat the first command, or choose another folder")
+        write_text(path, json.dumps(settings, indent=1) + "\n")
 
 
 def run(project: Plain[Project]) -> int:

@@ -110,9 +110,8 @@ def test_prune_keeps_a_share_of_what_remains(folder, tmp_path, capsys):
 
 
 def test_pack_cuts_and_a_scene_that_is_all_floaters_is_refused(folder, tmp_path, capsys):
-    out = tmp_path / "a.sundae"
-    assert run("pack", folder / "a.ply", "-o", out, "--remove-floaters", "--crop", 0, 0, 0, 9, 9, 9) == 0
-    assert sn.load(out).num_gaussians == 400
+    assert run("pack", folder / "a.ply", "-o", tmp_path / "a.sundae", "--remove-floaters", *INSIDE[:4], 9, 9, 9) == 0
+    assert sn.load(tmp_path / "a.sundae").num_gaussians == 400
     beside = sn.Camera.look_at((3, -3, 0.5), (3, 0.5, 0.5), fov=10, width=64, height=48)
     sn.save(dataclasses.replace(scene(), cameras=(beside,)), tmp_path / "b.sundae")
     assert run("export", tmp_path / "b.sundae", "-o", tmp_path / "b.spz", "--remove-floaters") == 2

@@ -164,7 +164,6 @@ def test_a_step_that_fails_ends_with_its_code_and_is_repeated(commands, capsys, 
 def test_an_interrupted_training_resumes(commands, capsys):
     assert started(commands, *OUT, "--steps", "100", codes={"ns-train": 137}) == STEPS[:2]
     first = commands.ran[1]
-    capsys.readouterr()
     assert started(commands, *OUT, "--steps", "100", codes={"ns-train": 130}) == ["ns-train"]
     assert "the same command continues here" in capsys.readouterr().err
     assert commands.ran[0] == first, "there was no checkpoint"
@@ -205,10 +204,12 @@ def test_four_placed_photos_are_enough(commands, capsys):
 
 
 def test_other_or_damaged_settings_are_refused(commands, capsys):
-    assert run(*OUT) == 0
+    started(commands, *OUT, "--start-view", "99", codes={"sundae pack": 2})
+    assert started(commands, *OUT, "--start-view", "2") == STEPS[2:], "a wrong view costs no training"
+    capsys.readouterr()
     for more, cause in (
         (["--steps", "200"], "steps left out, not 200"),
-        (["--keep", "0.5"], "keep left out, not 0.5"),
+        (["--start-view", "1"], "start-view 2, not 1"),
         (["--method", "sundae-tiny"], "method sundae, not sundae-tiny"),
         (["--max-mb", "2"], "max-mb left out, not 2.0; repeat the first command, or choose another folder"),
     ):
@@ -245,8 +246,7 @@ def test_names_with_a_dash_are_no_options(commands):
         paths = [word for word in words if "photos" in word or "out" in word.replace("--out", "")]
         assert paths
         assert all(path.startswith(("./-", "--experiment-name=")) for path in paths), words
-    commands.ran.clear()
-    assert run("./-out/capture", "-o", "./-again", "--keep", "0.5", "--crop", 0, 0, 0, 1, 1, 1) == 0
+    started(commands, "./-out/capture", "-o", "./-again", "--keep", "0.5", "--crop", 0, 0, 0, 1, 1, 1)
     assert commands.option("--data", 0) == "./-out/capture"
     assert "./-again/scene.sundae" not in commands.ran[-2], "photos show what a box leaves out"
 
