@@ -53,15 +53,20 @@ class Job:
 
 
 def parser_of(data: Path, downscale: int = 1) -> Words:
-    """Words of the data parser for a capture: none for a ``transforms.json``; for COLMAP every 8th is for test."""
+    """Words of the data parser for a capture: none for a ``transforms.json``; for COLMAP every 8th image is for test.
+
+    If all images are named ``train_...`` or ``eval_...``, the names decide instead.
+    """
     if (data / "sparse" / "0").is_dir():
         images = data / ("images" if downscale == 1 else f"images_{downscale}")
         if not images.is_dir():
             raise DataError(f"{images} does not exist; unpack all of the capture, or give another --downscale")
-        # Published smaller images are rounded to the nearest pixel.
+        named = {path.name.partition("_")[0] for path in images.iterdir()} == {"train", "eval"}
         return (
             *("colmap", "--colmap-path", "sparse/0", "--downscale-factor", str(downscale)),
-            *("--downscale-rounding-mode", "round", "--eval-mode", "interval", "--eval-interval", "8"),
+            # Published smaller images are rounded to the nearest pixel.
+            *("--downscale-rounding-mode", "round", "--eval-mode"),
+            *(("filename",) if named else ("interval", "--eval-interval", "8")),
         )
     if (data / "transforms.json").is_file():
         if downscale != 1:

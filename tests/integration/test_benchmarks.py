@@ -37,11 +37,6 @@ def run(monkeypatch, script, *words):
         runpy.run_path(str(FOLDER / script), run_name="__main__")
 
 
-def in_process(job, out):
-    """A job without a process of its own, which would load everything anew."""
-    perform(job, out)
-
-
 @pytest.fixture
 def jobs_here(monkeypatch):
     """Run the programs of jobs in this process, which has imported nerfstudio; their command lines."""
@@ -128,7 +123,7 @@ def test_the_suite_trains_a_method_as_its_command_does(tiny, tmp_path):
     captures, out = tmp_path / "captures", tmp_path / "out"
     shutil.copytree(tiny.scene, captures / "still-life")
     (captures / "torn").mkdir()
-    assert run_suite(SuiteOptions(folder=captures, out=out, arms=("sundae",), **SHORT), runner=in_process) == 1
+    assert run_suite(SuiteOptions(folder=captures, out=out, arms=("sundae",), **SHORT), runner=perform) == 1
     (row,) = read_rows(out / "results.csv")
     assert (row.scene, row.variant, row.keep_ratio, row.steps) == ("still-life", "sundae", 0.5, 24)
     assert row.peak_primitives > row.primitives
@@ -152,7 +147,7 @@ def test_a_scene_as_it_is_published(tiny, tmp_path):
     out = tmp_path / "out"
     publish(tiny.scene, tmp_path / "360_v2" / "bicycle")
     options = SuiteOptions(paper=True, folder=tmp_path, out=out, arms=("sundae",), **SHORT)
-    assert run_suite(options, runner=in_process) == 0
+    assert run_suite(options, runner=perform) == 0
     rows = [row for row in read_rows(out / "results.csv") if row.variant == "sundae"]
     # The published images, not the large ones, rounded as they are.
     assert [(row.scene, row.resolution) for row in rows] == [("bicycle", "48x48")]
@@ -161,6 +156,11 @@ def test_a_scene_as_it_is_published(tiny, tmp_path):
     page = (out / "table.md").read_text()
     assert "*23.23*" in page
     assert "Missing: bonsai, counter, garden" in page
+    capture = tmp_path / "360_v2" / "bicycle"
+    assert parser_of(capture)[-2:] == ("--eval-interval", "8")
+    for i, path in enumerate(sorted((capture / "images").iterdir())):
+        path.rename(path.with_name(f"{'train' if i % 8 else 'eval'}_{i}.png"))
+    assert parser_of(capture)[-2:] == ("--eval-mode", "filename")
 
 
 TRANSFORM = f"""#!{sys.executable}
