@@ -1,4 +1,4 @@
-"""Captures cut by lab/cut.py, whose images stay where they are: uncut.py pack CUT CAPTURE OUT, or uncut.py unpack FOLDER SCENES."""
+"""Captures cut by lab/few_views.py, whose images stay where they are: uncut.py pack CUT CAPTURE OUT, or uncut.py unpack FOLDER SCENES."""
 
 import shutil
 import sys
@@ -8,8 +8,8 @@ kind, first, second, *rest = sys.argv[1:]
 if kind == "pack":
     cut, capture, out = Path(first), Path(second), Path(rest[0])
     shutil.copytree(cut / "sparse", out / "sparse", dirs_exist_ok=True)
-    originals = {str(path.relative_to(capture / "images")).replace("/", "_"): str(path.relative_to(capture / "images")) for path in (capture / "images").rglob("*") if path.is_file()}
-    (out / "names.txt").write_text("".join(f"{path.name}\t{originals[path.name.split('_', 1)[1]]}\n" for path in sorted((cut / "images").iterdir())))
+    originals = sorted(str(path.relative_to(capture / "images")) for path in (capture / "images").rglob("*") if path.is_file())
+    (out / "names.txt").write_text("".join(f"{path.name}\t{originals[int(path.stem.split('_')[1])]}\n" for path in sorted((cut / "images").iterdir())))
 else:
     for path in sorted(Path(first).iterdir()):
         capture, out = Path(second) / path.name.rsplit("-", 1)[0], Path(second) / path.name
