@@ -91,7 +91,7 @@ def lines(panel: Any, name: str, series: Callable[[dict[str, Any]], Any], x: str
     groups: dict[str, dict[Any, list[dict[str, Any]]]] = {}
     for row in lines_of(name):
         if label := series(row):
-            at = row[x] if x == "capture" else float(row[x].partition("%")[0])
+            at = row[x] if x == "capture" else float(row[x])
             groups.setdefault(label, {}).setdefault(at, []).append(row)
     for marker, (label, rows) in zip("osD^vPX*hd" * 2, groups.items()):
         line = marker if x == "capture" else f"{marker}-"

@@ -148,9 +148,9 @@ def scene_order(means: NDArray[np.float32]) -> tuple[NDArray[np.int64], int]:
     centred = means.astype(np.float64) - np.median(means, axis=0)
     reach = np.abs(centred)
     # Of a street, two coordinates of three are small: those along it are not far away.
-    centred /= max(np.median(reach), np.median(reach.max(axis=1)) / 8) or reach.mean() or 1.0
-    bent = np.arcsinh(centred)
+    spread = max(np.median(reach), np.median(reach.max(axis=1)) / 8) or reach.mean() or 1.0
+    bent = np.arcsinh(centred / spread)
     low, extent = bent.min(axis=0), np.ptp(bent, axis=0).max() or 1.0
-    shells = np.ceil(np.log2((np.abs(centred).max(axis=1) / 30).clip(min=1)))
+    shells = np.ceil(np.log2((reach.max(axis=1) / spread / 30).clip(min=1)))
     codes = interleave(((bent - low) / extent * (2**MAX_BITS - 1)).astype(np.uint64))
     return np.lexsort((codes, shells)), int((shells == 0).sum())

@@ -239,13 +239,12 @@ class Trials(Callback):
         """Hold views out; decide at once where trials cannot."""
         progress, state = self.progress, run.state
         indices = run.view_indices()
-        num_views = len(indices)
+        state.pruning[VIEWS] = num_views = len(indices)
         # A warm start skips the steps before the prune.
         progress.steps = progress.steps or (run.schedule_length or 0) + state.offset
         self._window = max(round(COUNT_SHARE * progress.steps), 1)
         self._folds, self._length = choice.plan_heads(indices, progress.steps)
         self._judges = choice.spread_cameras(indices, min(choice.MOST_HELD_OUT, num_views // choice.HELD_OUT_EVERY), 0)
-        state.pruning[VIEWS] = num_views
         if self.config.decides and "count" not in progress.chosen:
             self._prepare_counts(run, num_views)
         if self.decides_head and "head" not in progress.chosen:
