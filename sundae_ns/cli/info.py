@@ -28,7 +28,7 @@ def info(scene: Scene, cameras: File = None, json: Flag = False) -> int:
         print(dumps(without_nan(facts)))
         return 0
     facts["invisible"] = f"{facts['invisible']:.1%} of the Gaussians, to {facts.pop('seen_by')}"
-    facts["crop"] = f"--crop {_words(facts['crop'])} holds 99% of what they see"
+    facts["crop"] = f"--crop {' '.join(f'{side:.15g}' for side in facts['crop'])} holds 99% of what they see"
     for name, value in facts.items():
         attributes = value if isinstance(value, dict) else {}
         line = f"{name.replace('_', ' '):22}{'' if attributes else _words(value)}".rstrip()

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 from collections.abc import Iterable, Sequence
 
-import numpy as np
 import torch
 from rich.console import Console
 from torch import Tensor
@@ -188,17 +188,35 @@ def remove_floaters(
 
 def crop_mask(scene: Scene, low: AnyArray, high: AnyArray) -> Tensor:
     """True for the Gaussians in a box, bool ``[N]``; arguments and errors as for :func:`crop`."""
-    means = scene.gaussians["means"].detach().double()  # exact, and holds survey coordinates
-    means = means + means.new_tensor(scene.offset or (0.0, 0.0, 0.0))
+    means = means_in_file(scene)
     lowest, highest = (numbers(corner, "a corner of the box", (3,)).to(means.device) for corner in (low, high))
     if not bool((lowest < highest).all()):
         raise ConfigError("the box is empty; give its lowest x y z first, then its highest")
     inside = ((means >= lowest) & (means <= highest)).all(dim=1)
     if not bool(inside.any()):
-        ends = np.quantile(means.cpu().numpy(), (0.05, 0.95), axis=0)
-        corners = (" ".join(f"{value:.{3 if scene.offset is None else 10}g}" for value in corner) for corner in ends)
-        raise DataError(f"no Gaussian is in the box; most of them lie between {' and '.join(corners)}")
+        most = " ".join(f"{side:.15g}" for side in box_of(means, torch.ones_like(means[:, 0]), 0.9))
+        raise DataError(f"no Gaussian is in the box; 90% of them are in {most}")
     return inside
+
+
+def means_in_file(scene: Scene) -> Tensor:
+    """Centres in the coordinates of the scene's file, also those of a survey: float64 ``[N, 3]``."""
+    means = scene.means.detach().double()
+    return means + means.new_tensor(scene.offset or (0.0, 0.0, 0.0))
+
+
+def box_of(means: Tensor, weights: Tensor, share: float = 0.99) -> list[float]:
+    """A box, lowest and highest x, y and z, that holds at least a share of weights ``[N]`` at centres ``[N, 3]``.
+
+    Each face cuts off at most a sixth of the rest. Numbers are rounded outwards, by a thousandth of the longest side.
+    """
+    values, order = means.sort(dim=0)
+    sums = weights[order].double().cumsum(0).T.contiguous()
+    cut = sums[:, -1:] * (1 - share) / 6
+    sides = values.T.gather(1, torch.searchsorted(sums, torch.cat([cut, sums[:, -1:] - cut], dim=1))).tolist()
+    digits = 3 - math.floor(math.log10(max(high - low for low, high in sides) or 1.0))
+    low = [round(math.floor(low * 10.0**digits) / 10.0**digits, digits) for low, _ in sides]
+    return low + [round(math.ceil(high * 10.0**digits) / 10.0**digits, digits) for _, high in sides]
 
 
 def for_cleaning(cameras: Sequence[Camera]) -> list[Camera]:

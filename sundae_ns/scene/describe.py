@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import math
 import re
 import zipfile
 from collections import Counter
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import torch
 from rich.console import Console
-from torch import Tensor
 
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.files import write_image
@@ -23,7 +22,7 @@ from sundae_ns.io.formats import METAS, kind_of, kind_of_gaussians
 from sundae_ns.io.pack.container import read_header
 from sundae_ns.io.splat import rank_files
 from sundae_ns.scene.cameras import spread
-from sundae_ns.scene.compose import floater_mask, for_cleaning
+from sundae_ns.scene.compose import box_of, floater_mask, for_cleaning, means_in_file
 from sundae_ns.scene.page import opened_page
 from sundae_ns.scene.prune_scene import at_most, weights_in
 from sundae_ns.scene.scene import Scene, image_of, render
@@ -69,9 +68,9 @@ def describe(
     cameras = cameras or scene.cameras
     views = for_cleaning(cameras) or virtual_cameras(scene, LOOKING)
     weights = weights_in(scene, views, console=console)
-    means = scene.means + scene.means.new_tensor(scene.offset or (0.0, 0.0, 0.0), dtype=torch.float64)
-    end = 1 << 16 if path.is_file() and kind_of(path) != "sog" else None  # a .sog holds its meta.json anywhere
-    stated = _PRODUCER.search(path.read_bytes()[:end] if path.is_file() else b"")
+    means = means_in_file(scene)
+    with path.open("rb") if path.is_file() else BytesIO() as file:
+        stated = _PRODUCER.search(file.read(-1 if kind_of(path) == "sog" else 1 << 16))  # its meta.json is anywhere
     return {
         "bytes": bytes_at(path) or bytes_of(scene.gaussians) + bytes_of_module(scene.head),
         "gaussians": scene.num_gaussians,
@@ -110,19 +109,3 @@ def bytes_by_attribute(scene: Scene, path: Path) -> dict[str, int]:
         sizes |= {f"{name}, fp32": 4 * value.numel() for name, value in scene.gaussians.items()}
         sizes["head"] = bytes_of_module(scene.head)
     return {name: size for name, size in sizes.items() if size}
-
-
-def box_of(means: Tensor, weights: Tensor, share: float = 0.99) -> list[float]:
-    """A box, lowest and highest x, y and z, that holds at least a share of weights ``[N]`` at centres ``[N, 3]``.
-
-    Each face cuts off at most a sixth of the rest. Numbers are rounded outwards, by a thousandth of the longest side.
-    """
-    sides = []
-    for values in means.T:
-        order = values.argsort()
-        sums = weights[order].double().cumsum(0)
-        cut = sums[-1] * (1 - share) / 6
-        sides.append(values[order[torch.searchsorted(sums, torch.stack([cut, sums[-1] - cut]))]].tolist())
-    digits = 3 - math.floor(math.log10(max(high - low for low, high in sides) or 1.0))
-    low = [round(math.floor(low * 10.0**digits) / 10.0**digits, digits) for low, _ in sides]
-    return low + [round(math.ceil(high * 10.0**digits) / 10.0**digits, digits) for _, high in sides]

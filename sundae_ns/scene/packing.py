@@ -95,10 +95,10 @@ def stated_start(scene: Scene) -> dict[str, Any]:
 
 def start_of(stated: Mapping[str, Any]) -> tuple[Direction | None, Camera | None]:
     """Up axis and start view of JSON values; None for one that is missing, or that the schema refuses."""
-    valid = [name for name in ("up", "start") if name in stated and fault(stated[name], _PROPERTIES[name]) is None]
-    start = stated["start"] if "start" in valid else None
-    camera = start and Camera.from_pose(start["pose"], start["intrinsics"], *start["size"])
-    return unit(stated["up"]) if "up" in valid else None, camera
+    names = {"up", "start"} & stated.keys()
+    valid = {name: stated[name] for name in names if fault(stated[name], _PROPERTIES[name]) is None}
+    up, start = valid.get("up"), valid.get("start")
+    return up and unit(up), start and Camera.from_pose(start["pose"], start["intrinsics"], *start["size"])
 
 
 def arrays_of_cameras(cameras: Sequence[Camera]) -> dict[str, Tensor]:

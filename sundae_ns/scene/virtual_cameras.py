@@ -138,11 +138,9 @@ def of_unit_size(scene: Scene, cameras: Sequence[Camera]) -> tuple[Scene, list[C
     The size is the median distance of the Gaussians from their middle; 1 for nerfstudio's model, which stays as it is.
     """
     size = 1.0 if scene.in_model_frame else middle_and_reach(usable(scene))[1]
-    scaled: list[Camera] = []
-    for camera in cameras:
-        viewmat = camera.viewmat.clone()
-        viewmat[:3, 3] /= size
-        scaled.append(camera._replace(viewmat=viewmat).to(scene.device))
+    divisors = torch.ones(4, 4)
+    divisors[:3, 3] = size  # of translations
+    scaled = [each._replace(viewmat=each.viewmat / divisors.to(each.viewmat)).to(scene.device) for each in cameras]
     if size != 1:
         scene = dataclasses.replace(scene, gaussians=resized(scene.gaussians, 1 / size), cameras=())
     return scene, scaled, size

@@ -112,10 +112,7 @@ def test_a_box_is_exact_and_keeps_all_else():
 
 def test_an_empty_result_says_where_the_scene_is():
     broken = scene_of(wall(), 0.1)
-    with pytest.raises(DataError, match=r"most of them lie between -1\.\d+ .* and 1\.\d+ "):
+    with pytest.raises(DataError, match=r"90% of them are in -1\.\d+ \S+ \S+ 1\.\d+ "):
         sn.crop(broken, (50, 50, 50), (51, 51, 51))
     with pytest.raises(ConfigError, match="the box is empty"):
         sn.crop(broken, (0, 0, 0), (1, 1, 0))
-    broken.gaussians["means"][:] = math.nan
-    with pytest.raises(DataError, match="no Gaussian is in the box"):
-        sn.crop(broken, (0, 0, 0), (1, 1, 1))
