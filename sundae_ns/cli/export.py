@@ -88,8 +88,6 @@ def export(
         degree = stated if suffix == ".ply" else min(stated, MAX_SH_DEGREE)
         mode = ", antialiased" if left.scene.antialiased else ""
         print(f"{out}: {left.scene.num_gaussians:,} Gaussians, degree {degree}{mode}, {out.stat().st_size:,} bytes")
-        if degree < stated:
-            print(f"left out harmonics above SH degree {degree}, which {suffix} cannot store; .ply can")
         exact = suffix in (".ply", ".glb") and degree == before.scene.gaussians.sh_degree
         costs = not exact or before.scene.head is not None or changes
     if costs:

@@ -71,6 +71,8 @@ class Edit(NamedTuple):
             moved = (self.pruned and self.pruned.moved) or self.form.degree < self.scene.gaussians.sh_degree
             keep_vertices(self.source, out, self.rows, self.stated.gaussians if moved else None, self.scene.up)
         else:
+            if kind_of(self.source) == "ply" and out.suffix.lower() == ".ply":
+                print(f"{self.source} is text or has no SH colours; columns of its own are left out", file=sys.stderr)
             save(self.stated, out, upright=upright, config=self.form.precision)
 
     def cut(self, mask: Tensor) -> Edit:

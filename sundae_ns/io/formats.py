@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.core.errors import CheckpointError, DataError, SundaeError, regular
-from sundae_ns.core.gaussians import SPLAT_NAMES, Gaussians, Sanitised, sanitise
+from sundae_ns.core.gaussians import SPLAT_NAMES, Gaussians, Sanitised, sanitise, sh_degree
 from sundae_ns.io import checkpoint
 from sundae_ns.io.coordinates import Direction, recentred, similarity, upward
 from sundae_ns.io.gltf import read_glb, write_glb
@@ -120,8 +120,7 @@ def usable(params: Mapping[str, Tensor], path: Path, failure: type[SundaeError] 
     """The Gaussians of a file that have a meaning, with finite values; logs what was changed. None is a ``failure``."""
     sanitised = sanitise(params)
     if not sanitised.gaussians.num_gaussians:
-        n = len(params["means"])
-        raise failure(f"{path} has {n:,} Gaussians, and none is finite; export it again or give another")
+        raise failure(f"{path} has {len(params['means']):,} Gaussians, and none is finite; export it again")
     if summary := sanitised.summary():
         _log.warning("%s: %s", path, summary)
     return sanitised
@@ -197,6 +196,7 @@ def _prepared(params: Mapping[str, Tensor], kind: str, marks: Marks, upright: bo
         turn = UPRIGHT[:, :3].double().numpy()
         up, offset = (vector and tuple((turn @ vector).tolist()) for vector in (marks.up or _MODEL_UP, marks.offset))
         marks = marks._replace(in_model_frame=False, up=up, offset=offset)
-    if kind != ".ply":
+    if kind != ".ply" and sh_degree(gaussians["features_rest"]) > MAX_SH_DEGREE:
+        _log.warning("a %s holds no harmonics above SH degree %d; a .ply does", kind, MAX_SH_DEGREE)
         gaussians["features_rest"] = gaussians["features_rest"][:, : (MAX_SH_DEGREE + 1) ** 2 - 1]
     return gaussians, marks

@@ -12,7 +12,7 @@ Written from the format's public description, because no maintained Python packa
 
 Codebooks are k-means in one dimension. With more Gaussians than palette rows, these are centres of a two-level
 k-means. Coordinates are those of a .ply, as in files of ``splat-transform``. Own entries of ``meta.json``, which other
-programs ignore: ``up``, and ``offset``, what was subtracted from coordinates too large for float32.
+programs ignore: ``up``; ``offset``, what was subtracted from coordinates too large for float32; and ``modelFrame``.
 
 Streamed SOG, version 1: a folder of levels of detail, the full one first, in chunks that are folders of the above.
 
@@ -147,6 +147,7 @@ def _encoded(arrays: Mapping[str, NDArray[np.float32]], marks: Marks) -> dict[st
         "count": n,
         "antialias": marks.antialiased,
         **({"model": "antialiased"} if marks.antialiased else {}),  # what splat-transform reads
+        **({"modelFrame": True} if marks.in_model_frame else {}),
         **{name: list(value) for name in ("up", "offset") if (value := getattr(marks, name))},
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"codebook": scale_values.tolist(), "files": ["scales.webp"]},
@@ -196,7 +197,7 @@ def _scene(path: Path, entry: Entry, size: int) -> tuple[dict[str, Tensor], Mark
         raise DataError(f"{path} has version {version} of the format; convert it with splat-transform to version 2")
     up, offset = (vector(" ".join(map(str, meta.get(name, ())))) for name in ("up", "offset"))
     antialiased = any(str(meta.get(name)).lower() in ANTIALIASED for name in ("antialias", "model"))
-    return _decoded(entry, meta, size), Marks(antialiased, up=up, offset=offset)
+    return _decoded(entry, meta, size), Marks(antialiased, meta.get("modelFrame") is True, up, offset)
 
 
 def _finest_level(path: Path, entry: Entry, size: int) -> tuple[dict[str, Tensor], Marks]:

@@ -39,7 +39,6 @@ from sundae_ns.io.ply import LEAST_OPACITY, UNMARKED, Marks, check_gaussians
 _SPLAT = np.dtype([("means", "<f4", 3), ("widths", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 _HEADER, _HEADER_BYTES = struct.Struct("<BBxxIIIIHxx12x2f"), 4096
 _SECTION, _SECTION_BYTES = struct.Struct("<IIIIfHxxIIIIH"), 1024
-_SH_DTYPES = ("<f4", "<f2", "u1")  # by level
 _GSPLAT_NAMES = {name: name for name in SPLAT_NAMES} | {"features_dc": "sh0", "features_rest": "shN"}
 
 
@@ -104,7 +103,7 @@ def _section(
         raise ValueError("a section's SH degree, Gaussians and buckets do not fit together")
     real = "<f2" if level else "<f4"
     columns = [("means", "<u2" if level else "<f4", 3), ("widths", real, 3), ("quats", real, 4), ("rgba", "u1", 4)]
-    kind = np.dtype([*columns, ("harmonics", _SH_DTYPES[level], 3 * ((degree + 1) ** 2 - 1))])
+    kind = np.dtype([*columns, ("harmonics", ("<f4", "<f2", "u1")[level], 3 * ((degree + 1) ** 2 - 1))])
     centers = start + 4 * partial
     first = centers + center_bytes * buckets
     # numpy refuses what reaches beyond the file, before larger arrays are made of it.

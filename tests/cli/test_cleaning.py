@@ -55,6 +55,9 @@ def test_export_cuts_a_ply_and_keeps_its_rows(folder, tmp_path, capsys):
     assert run("export", folder / "a.ply", "-o", tmp_path / "b.ply", "--remove-floaters") == 0
     assert np.array_equal(vertices(tmp_path / "b.ply"), before[1:401])
     assert "removed 1 floaters of 401 Gaussians, by their neighbours alone" in capsys.readouterr().err
+    PlyData([*PlyData.read(folder / "a.ply")], text=True).write(tmp_path / "text.ply")
+    assert run("export", tmp_path / "text.ply", "-o", tmp_path / "c.ply") == 0
+    assert "text.ply is text or has no SH colours; columns of its own are left out" in capsys.readouterr().err
 
 
 def test_export_to_a_page_and_to_other_formats(folder, tmp_path):
