@@ -20,7 +20,7 @@ from sundae_ns.cli.refusals import check_folder, check_least
 from sundae_ns.core.errors import ConfigError, DataError, SundaeError, one_line
 from sundae_ns.data import reconstruct
 from sundae_ns.data.capture_files import Placed
-from sundae_ns.data.photos import LEAST_PHOTOS, find_photos, left_out, masks_beside, masks_of
+from sundae_ns.data.photos import LEAST_PHOTOS, find_photos, masks_beside, masks_of
 from sundae_ns.data.video import SUFFIXES, check_video, is_video
 
 _warn = partial(print, "# warning:", flush=True)
@@ -52,11 +52,10 @@ def poses(photos: Input, out: Out, options: Plain[PoseOptions] = PoseOptions()) 
     request = reconstruct.Request(photos, out, options.matching, options.frames, masks)
     placed = _interruptible(lambda: reconstruct.find_poses(request, _report, _warn), request.work)
     counts = f"{len(placed.placed):,} of {placed.total:,} photos have a pose, of {placed.cameras} camera"
-    print(f"{out}: {counts}{'s' * (placed.cameras > 1)}; mean reprojection error {placed.error:.2f} px")
+    masked = "" if masks is None else f"; masks are those of {masks}"
+    print(f"{out}: {counts}{'s' * (placed.cameras > 1)}; mean reprojection error {placed.error:.2f} px{masked}")
     if others := ", ".join(f"{count:,}" for count in placed.models[1:]):
         print(f"# this is the largest of {len(placed.models)} models that do not join; others have {others} photos")
-    if placed.masks is not None:
-        print(f"# masks: {placed.masks}")
     if placed.left_out:
         names = ", ".join(placed.left_out[:3]) + (", ..." if len(placed.left_out) > 3 else "")
         warning = "" if placed.enough else "warning: "
@@ -77,8 +76,6 @@ def check_poses(photos: Path, options: PoseOptions, *, remarks: bool = True) -> 
     if not photos.is_dir():
         raise DataError(f"{photos} is no folder of photos or video ({', '.join(SUFFIXES)}); sundae prune takes scenes")
     files = find_photos(photos, warn)
-    if (remark := left_out(photos)) is not None:
-        warn(remark)
     masks = options.masks or masks_beside(photos)
     try:
         if masks is not None:

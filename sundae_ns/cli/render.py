@@ -43,6 +43,8 @@ def render(
     if fps is not None and not (video and 0 < fps <= 240):
         raise ConfigError("--fps is of a video, from above 0 to 240; leave it out, or name a video .mp4")
     check_file(out, reads=[scene, advanced.cameras], overwrite=advanced.overwrite)
+    if advanced.preview is not None and advanced.preview.resolve() == out.resolve():
+        raise ConfigError(f"{out} is the image and its --preview; name another file for one")
     edit = opened(scene, wishes, advanced, most=MOST_CAMERAS)
     views = list(edit.scene.cameras)
     if (seconds is not None and (edit.speed is not None or not video)) or (video and view is not None):

@@ -138,9 +138,8 @@ class Project:
 
     def _trained(self) -> bool:
         """Whether the last step is saved, of those before the pack's fine-tune."""
-        if (left := steps_left(self.run)) is None or left <= 0:
-            return left is not None
-        return self.tunes and left <= tuned_steps(schedule_length(self.run / "config.yml"))
+        left, config = steps_left(self.run), self.run / "config.yml"
+        return left is not None and left <= (tuned_steps(schedule_length(config)) if self.tunes else 0)
 
     def claim(self) -> None:
         """Make the folder and lock it, or check that an earlier command with the same settings made it."""

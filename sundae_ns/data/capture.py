@@ -60,9 +60,9 @@ def rigid(pose: np.ndarray, where: str) -> np.ndarray:
     return pose if abs(scale - 1) <= 1e-3 else np.hstack([pose[:, :3] / scale, pose[:, 3:]])  # rounded ones stay
 
 
-def read_json(path: Path, *, slashes: bool = True) -> dict[str, Any]:
+def read_json(path: Path, *, slashes: bool = True, remedy: str = "write it again") -> dict[str, Any]:
     """The JSON object of a file, with ``slashes`` in Windows paths; ``DataError`` if it cannot be read or is none."""
-    with reading(path, "JSON", remedy="write it again"), regular(path).open("rb") as file:
+    with reading(path, "JSON", remedy=remedy), regular(path).open("rb") as file:
         text = file.read(_MOST_BYTES + 1)
         if len(text) > _MOST_BYTES or sum(map(text.count, b"[{:")) > 2_000_000:
             raise DataError(f"{path} has more than 32 MB, or two million lists and entries; split it")

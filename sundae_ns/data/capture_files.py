@@ -38,7 +38,6 @@ class Placed(NamedTuple):
     cameras: int = 1
     error: float = 0.0  # mean reprojection error, pixels
     models: tuple[int, ...] = ()  # numbers of images of COLMAP's models; the first and largest is the capture
-    masks: str | None = None  # how many frames have a mask, "24 of 24"
 
     @property
     def total(self) -> int:

@@ -44,7 +44,7 @@ class Photo(NamedTuple):
 def find_photos(folder: Path, warn: Warn = str) -> list[Photo]:
     """The photos in a folder and its subfolders, sorted by path, judged by their headers.
 
-    Hidden files and folders and those of masks are left out, and photos that cannot be read, with a line to ``warn``.
+    Hidden files and folders and those of masks are left out, and, with a line to ``warn``, photos that are not read.
     """
     with reading(folder, "a folder of photos"):
         suffixes = [suffix for suffix in SUFFIXES if suffix not in images.HEIF or images.reads_heif()]
@@ -60,6 +60,8 @@ def find_photos(folder: Path, warn: Warn = str) -> list[Photo]:
         few = f"{len(paths)} photo{'s' * (len(paths) > 1)}"
         raise DataError(f"{folder} holds {few}, and camera poses need {LEAST_PHOTOS} or more that overlap; add some")
     photos = list(usable(paths, photo_of, warn))
+    if others := left_out(folder):
+        warn(others)
     named = {path.with_suffix(""): path for path in reversed(paths)}  # RAW files and HEIC lie beside their JPEG
     twins = copies(photo.path for photo in photos)
     twins |= {path: first for path in paths if (first := named[path.with_suffix("")]) != path}

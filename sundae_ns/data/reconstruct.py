@@ -111,7 +111,6 @@ def find_poses(request: Request, report: Reporter, warn: Warn = print) -> Placed
         cameras=len({Path(name).parent for name in _posed(models[0])}),
         error=float(models[0].compute_mean_reprojection_error()),
         models=tuple(len(_posed(model)) for model in models),
-        masks=f"{len(placed.placed)} of {len(placed.placed)}" if masks else None,
     )
 
 

@@ -138,9 +138,9 @@ def _open_file(path: Path, scene: Scene, data: Path | None) -> Opened:
         scene = replace(scene, background_color="white")  # as `sundae train` reads this layout
     model = model_of(scene).to(fastest_device())
     manager = config.setup(device=model.device, test_mode="test", world_size=1, local_rank=0)
-    source = stated if isinstance(stated := scene.meta.get("source"), dict) else {}
+    source = scene.meta.get("source", {})
     method = str(source.get("method") or "sundae")
-    steps = step + 1 if isinstance(step := source.get("step"), int) else 0
+    steps = source["step"] + 1 if isinstance(source.get("step"), int) else 0
     return Opened(model, manager, path, data, method, path.name, steps, packed_bytes=path.stat().st_size)
 
 

@@ -63,10 +63,11 @@ def read_cameras(path: Path, scene: Scene | None = None) -> tuple[list[Camera], 
     stated = path / "transforms.json" if path.is_dir() else path
     models = [path] if is_model(path) else [] if stated.exists() else [path / name for name in models_in(path)]
     path = models[0] if models else stated
-    content: dict[str, Any] = {} if models else with_focal_lengths(read_json(path), path.parent)
+    remedy = "give a transforms.json, the folder of a COLMAP model, or a camera path"
+    content: dict[str, Any] = {} if models else with_focal_lengths(read_json(path, remedy=remedy), path.parent)
     entries: Any = [*read_images(path).values()] if models else content.get("camera_path", content.get("frames"))
     if not isinstance(entries, list) or not entries:
-        raise DataError(f"{path} holds neither frames nor a camera_path; give a transforms.json or a camera path")
+        raise DataError(f"{path} holds neither frames nor a camera_path; {remedy}")
     if len(entries) > MOST_CAMERAS:
         raise DataError(f"{path.name} has {len(entries):,} cameras; give at most {MOST_CAMERAS:,}")
     read = _of_path if "camera_path" in content else _of_frame if content else _of_colmap

@@ -64,7 +64,7 @@ def find(photos, warn=str, **changes):
 def test_photos_become_a_capture(colmap, photos):
     found, stages = find(photos)
     assert len(found.placed) == PHOTOS
-    assert (found.cameras, found.error, found.models, found.masks) == (1, 0.5, (PHOTOS,), None)
+    assert (found.cameras, found.error, found.models) == (1, 0.5, (PHOTOS,))
     capture = photos.parent / "capture"
     meta = check_transforms(capture / "transforms.json")
     assert [frame["original"] for frame in meta["frames"]] == [f"{i}.JPG" for i in range(PHOTOS)]
@@ -150,7 +150,7 @@ def test_masks_reach_the_capture_beside_a_broken_photo(colmap, photos, tmp_path)
     (photos / "1.JPG").write_bytes(content[: content.index(b"\xff\xda") + 14])
     colmap.models, said = [6], []
     found, _ = find(photos, said.append, masks=tmp_path / "masks")
-    assert (found.masks, found.left_out) == ("6 of 6", ("7.JPG",))
+    assert found.left_out == ("7.JPG",)
     assert "1.JPG is not a photo that can be decoded" in said[0]
     frames = check_transforms(tmp_path / "capture" / "transforms.json")["frames"]
     assert frames[1]["mask_path"] == "masks/frame_00003.png"
