@@ -54,7 +54,7 @@ def poses(photos: Input, out: Out, options: Plain[PoseOptions] = PoseOptions()) 
     counts = f"{len(placed.placed):,} of {placed.total:,} photos have a pose, of {placed.cameras} camera"
     masked = "" if masks is None else f"; masks are those of {masks}"
     print(f"{out}: {counts}{'s' * (placed.cameras > 1)}; mean reprojection error {placed.error:.2f} px{masked}")
-    if others := ", ".join(f"{count:,}" for count in placed.models[1:]):
+    if placed.left_out and (others := ", ".join(f"{count:,}" for count in placed.models[1:])):
         print(f"# this is the largest of {len(placed.models)} models that do not join; others have {others} photos")
     if placed.left_out:
         names = ", ".join(placed.left_out[:3]) + (", ..." if len(placed.left_out) > 3 else "")
@@ -73,7 +73,7 @@ def check_poses(photos: Path, options: PoseOptions, *, remarks: bool = True) -> 
             raise ConfigError("a video has no masks; leave out --masks")
         check_video(photos, warn)
         return None
-    if not photos.is_dir():
+    if photos.exists() and not photos.is_dir():
         raise DataError(f"{photos} is no folder of photos or video ({', '.join(SUFFIXES)}); sundae prune takes scenes")
     files = find_photos(photos, warn)
     masks = options.masks or masks_beside(photos)

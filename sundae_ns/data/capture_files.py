@@ -194,8 +194,6 @@ def write_demo_capture(out: Path) -> Path:
 
     An earlier copy is replaced, other files are a ``DataError``. An interrupted copy has no ``transforms.json``.
     """
-    if out.exists() and not out.is_dir():
-        raise DataError(f"{out} is a file; name a folder for the capture")
     if out.is_dir() and any(out.iterdir()) and not (out / MARKER).exists():
         raise DataError(f"{out} holds other files than the demo's capture; name a new or an empty folder")
     (out / "images").mkdir(parents=True, exist_ok=True)

@@ -126,7 +126,7 @@ def check_colmap(model: Path, images: Path | None, *, points: bool = True) -> No
     if hostile := next((name for name in [str(images or ""), *names] if set(name) & set('"$`\\\n')), None):
         raise DataError(f"{hostile!r} has quotes, $, ` or backslashes in its name; rename it without them")
     if images is not None and (missing := [images / name for name in names if not (images / name).is_file()]):
-        raise DataError(f"{missing[0]} does not exist{beside(missing[0])}; check --images-path, or remove the view")
+        raise DataError(f"{missing[0]} does not exist{beside(missing[0])}; put it there, or run colmap image_deleter")
     if points and not len(read_points(model)[0]):
         raise DataError(f"{model} has no points; start without them with colmap --load-3D-points False")
 

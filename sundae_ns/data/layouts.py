@@ -14,8 +14,9 @@ from sundae_ns.data.images import check_image
 
 LONGEST_SIDE = 1600  # pixels, of the images to train on, if smaller ones are there; as in nerfstudio
 # Folders where programs put COLMAP's models, directly or in numbered folders, and usual names of the folder of images.
-_MODELS = ("sparse", "colmap/sparse", "dense/sparse", "dense", "distorted/sparse", "sparse/aligned")
-_IMAGES = ("images", "input", "photos", "image", "rgb")
+_MODELS = "sparse colmap/sparse dense/sparse dense distorted/sparse sparse/aligned undistorted/sparse".split()
+_IMAGES = ("images", "Images", "input", "photos", "image", "rgb", "frames", "imgs", "color", "undistorted")
+_SUFFIXES = {".png", ".jpg", ".jpeg"}
 _BLENDER = "transforms_train.json"
 
 
@@ -40,7 +41,10 @@ def is_model(folder: Path) -> bool:
 def _model_folders(data: Path) -> list[Path]:
     usual = [data / name for name in _MODELS]
     numbered = [path for folder in usual for path in entries(folder) if path.name.isdigit()]
-    return [folder for folder in (*usual, *numbered) if is_model(folder)]
+    numbered += [path / "sparse" for path in numbered]  # dense/0/sparse, of COLMAP's automatic reconstruction
+    # RealityScan puts a model beside the images or their folder; one without them is no capture.
+    has_images = any(path.name in _IMAGES or path.suffix.lower() in _SUFFIXES for path in entries(data))
+    return [folder for folder in (*usual, *numbered, *([data] if has_images else [])) if is_model(folder)]
 
 
 def models_in(data: Path) -> dict[str, int]:
@@ -67,12 +71,15 @@ def _colmap_layout(data: Path, model: str, num_models: int = 1, masks: Path | No
     # Undistorted images lie beside their model.
     above = [data / model, *(folder for folder in (data / model).parents if folder.is_relative_to(data))]
     candidates = [*(folder / usual for folder in above for usual in _IMAGES), data]
-    if (images := next((folder for folder in candidates if (folder / names[0]).is_file()), None)) is None:
+    found = next(((folder, name) for folder in candidates for name in names if (folder / name).is_file()), None)
+    if found is None:
+        near = next(filter(None, (beside(folder / names[0]) for folder in candidates)), "")
         where = f"which its model {model} states, in {', '.join(_IMAGES)}"
-        raise DataError(f"{data} has no image {names[0]}, {where}; put it there")
-    longest = max(check_image(images / names[0]))
+        raise DataError(f"{data} has no image {names[0]}{near}, {where}; {'rename it' if near else 'put it there'}")
+    images, first = found
+    longest = max(check_image(images / first))
     downscale = 1
-    while longest / downscale > LONGEST_SIDE and (Path(f"{images}_{2 * downscale}") / names[0]).is_file():
+    while longest / downscale > LONGEST_SIDE and (Path(f"{images}_{2 * downscale}") / first).is_file():
         downscale *= 2
     folder = images.relative_to(data).as_posix()
     more = [] if folder == "images" else ["--images-path", folder]
@@ -111,10 +118,10 @@ def no_transforms(data: Path) -> DataError:
     advice = f"{data} has no transforms.json"
     if (data / _BLENDER).is_file():
         advice += f"; it is in Blender's layout ({_BLENDER}): add `blender-data` to ns-train"
-    elif is_model(data):
-        advice = f"{data} is a COLMAP model without its images; give the folder that holds both"
     elif models := models_in(data):
         advice += f"; it is in COLMAP layout: add {_words(data, models)} to ns-train"
+    elif is_model(data):
+        advice = f"{data} is a COLMAP model without its images; give the folder that holds both"
     elif inner := next((path for path in entries(data) if (path / "transforms.json").is_file()), None):
         advice += f", but {inner} has; give that folder"
     else:
@@ -151,4 +158,4 @@ def larger_model(data: Path, model: Path) -> str | None:
 def unused_masks(folder: Path) -> str | None:
     """Name of a folder of masks in a capture, if it has one with images."""
     kinds = {name: {path.suffix.lower() for path in entries(folder / name)} for name in ("masks", "mask")}
-    return next((name for name, suffixes in kinds.items() if suffixes & {".png", ".jpg", ".jpeg"}), None)
+    return next((name for name, suffixes in kinds.items() if suffixes & _SUFFIXES), None)

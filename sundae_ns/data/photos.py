@@ -53,12 +53,10 @@ def find_photos(folder: Path, warn: Warn = str) -> list[Photo]:
         listed = ", ".join(f"{path.relative_to(folder)}: {count:,}" for path, count in list(counts.items())[:3])
         where = f"{folder} holds {len(paths):,} photos in {len(counts)} folders ({listed}{', ...' * (len(counts) > 3)})"
         raise DataError(f"{where}; give the folder of one scene, or move its photos into one folder")
-    if not paths:
-        remark = f"({', '.join(SUFFIXES)}); give a folder of photos, or a capture"
-        raise DataError(f"{folder} holds no photos that can be read: {left_out(folder) or remark}")
     if len(paths) < LEAST_PHOTOS:
-        few = f"{len(paths)} photo{'s' * (len(paths) > 1)}"
-        raise DataError(f"{folder} holds {few}, and camera poses need {LEAST_PHOTOS} or more that overlap; add some")
+        few = f"{len(paths) or 'no'} photo{'s' * (len(paths) != 1)}, and camera poses need {LEAST_PHOTOS} or more"
+        none = f"give a folder that holds some ({', '.join(suffixes)}), or a video by its own path"
+        raise DataError(f"{folder} holds {few}; {left_out(folder) or ('add some that overlap' if paths else none)}")
     photos = list(usable(paths, photo_of, warn))
     if others := left_out(folder):
         warn(others)

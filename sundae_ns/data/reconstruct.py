@@ -106,12 +106,9 @@ def find_poses(request: Request, report: Reporter, warn: Warn = print) -> Placed
         flush(made / TRANSFORMS)  # written last; the system has written the other files meanwhile
         made.replace(request.capture)
         shutil.rmtree(work, ignore_errors=True)
-    placed = placed_in(request.capture)
-    return placed._replace(
-        cameras=len({Path(name).parent for name in _posed(models[0])}),
-        error=float(models[0].compute_mean_reprojection_error()),
-        models=tuple(len(_posed(model)) for model in models),
-    )
+    cameras, counts = len({Path(name).parent for name in _posed(models[0])}), [len(_posed(model)) for model in models]
+    error = float(models[0].compute_mean_reprojection_error())
+    return placed_in(request.capture)._replace(cameras=cameras, error=error, models=tuple(counts))
 
 
 def _keep_or_clear(request: Request, files: Sequence[Path]) -> None:

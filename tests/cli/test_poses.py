@@ -17,14 +17,15 @@ def poses(*words):
 
 
 def test_each_stage_and_the_result_are_one_line(colmap, capsys):
-    colmap.models = [6]
+    colmap.models = [6, 3]
     assert poses("photos", "-o", "capture") == 0
     lines = capsys.readouterr().out.splitlines()
     stages = ["images: 8 of 8", "features: 8 of 8", "matches of pairs: 28 of 28", "poses: 6 of 8", "capture: 6 of 6"]
     assert [line.rpartition(",")[0] for line in lines[:5]] == stages
     assert lines[5] == "capture: 6 of 8 photos have a pose, of 1 camera; mean reprojection error 0.50 px"
     again = "to add them, photograph the way from 5.JPG to 6.JPG again"
-    assert lines[6].startswith(f"# without a pose: 6.JPG, 7.JPG; {again}")
+    assert lines[6] == "# this is the largest of 2 models that do not join; others have 3 photos"
+    assert lines[7].startswith(f"# without a pose: 6.JPG, 7.JPG; {again}")
     assert len(json.loads(Path("capture/transforms.json").read_text())["frames"]) == 6
 
 
@@ -43,8 +44,10 @@ def test_masks_beside_the_photos_are_used(colmap, capsys):
 
 def test_a_video(colmap, capsys):
     write_video(Path("walk.mp4"), 40)
+    colmap.models = [9, 3]
     assert poses("walk.mp4", "-o", "capture", "--frames", "9") == 0
-    assert "frames: 9 of 9" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert ("frames: 9 of 9" in said, "models" in said) == (True, False), "the largest model has all frames"
 
 
 def test_names_are_no_options_and_nothing_of_a_shell(colmap, tmp_path):

@@ -142,7 +142,7 @@ def test_photos_that_are_not_read_are_named(photos, monkeypatch, capsys, names, 
     assert capsys.readouterr().out.startswith(f"# warning: {remark}")
     for path in photos.glob("*.png"):
         path.unlink()
-    refused(find_photos, photos, f"holds no photos that can be read: {remark}")
+    refused(find_photos, photos, f"holds no photos, and camera poses need 3 or more; {remark}")
 
 
 def test_photos_in_several_folders_only_are_counted_and_not_opened(tmp_path):
