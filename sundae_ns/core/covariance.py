@@ -10,8 +10,7 @@ from torch.nn.functional import normalize
 
 PAIRS = 1 << 18  # pairs of Gaussians whose overlap is computed at once; they take about 50 MiB
 ROWS = 1 << 16  # Gaussians whose matrices are computed at once; they take about 40 MiB
-# Rows and columns of the six entries of a symmetric matrix, diagonal first.
-LOWER = ([0, 1, 2, 1, 2, 2], [0, 1, 2, 0, 0, 1])
+LOWER = ([0, 1, 2, 1, 2, 2], [0, 1, 2, 0, 0, 1])  # rows and columns of a symmetric matrix's entries, diagonal first
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:

@@ -60,11 +60,12 @@ def floats(values: Any, name: str, *, colors: bool = False) -> Tensor:
 
 
 def positions(values: Any, name: str) -> Tensor:
-    """As :func:`floats`; ``DataError`` too if float32 moves positions by 1e-4 of their extent, as those of surveys."""
+    """As :func:`floats`; ``DataError`` too if float32 moves positions by 1e-4 of their spread, as those of surveys."""
     if (tensor := floats(values, name)) is values or not tensor.numel():
         return tensor
     exact = values.double() if isinstance(values, Tensor) else torch.from_numpy(np.asarray(values).astype(np.float64))
-    if (exact - tensor).abs().max() > 1e-4 * (exact.amax(dim=0) - exact.amin(dim=0)).max() > 0:  # one point has none
+    moved, spread = ((exact - other).abs().amax(dim=-1).median() for other in (tensor, exact.median(dim=0).values))
+    if moved > 1e-4 * spread > 0:  # medians, as outliers may lie far away; one point has no spread
         raise DataError(f"{name} is too far from zero for float32; subtract its median, and add it to what you export")
     return tensor
 
