@@ -14,7 +14,7 @@ from sundae_ns.cli.options import Advanced, File, Flag, Out, Plain, Scene, Scene
 from sundae_ns.cli.refusals import check_file, check_folder, check_suffix
 from sundae_ns.core.errors import ConfigError
 from sundae_ns.io.formats import FORMATS, kind_of, write_levels
-from sundae_ns.io.ply import MAX_SH_DEGREE
+from sundae_ns.io.ply import STORED_SH_DEGREE
 from sundae_ns.io.run_folder import files_of
 from sundae_ns.io.sog import STREAMED
 from sundae_ns.rasterize.interface import fastest_device
@@ -85,7 +85,7 @@ def export(
         with Console(stderr=True).status(f"Writing {left.scene.num_gaussians:,} Gaussians"):  # a .sog takes minutes
             left.write(out, upright=upright)
         stated = left.stated.gaussians.sh_degree
-        degree = stated if suffix == ".ply" else min(stated, MAX_SH_DEGREE)
+        degree = stated if suffix == ".ply" else min(stated, STORED_SH_DEGREE)
         mode = ", antialiased" if left.scene.antialiased else ""
         print(f"{out}: {left.scene.num_gaussians:,} Gaussians, degree {degree}{mode}, {out.stat().st_size:,} bytes")
         exact = suffix in (".ply", ".glb") and degree == before.scene.gaussians.sh_degree

@@ -53,10 +53,10 @@ def matrix(value: Any, rows: Sequence[int], name: str, where: str) -> np.ndarray
 def rigid(pose: np.ndarray, where: str) -> np.ndarray:
     """A camera pose ``[3 or 4, 4]`` without a scale in its rotation; ``DataError`` if its axes are no rotation."""
     if np.abs(pose[3:, :3]).max(initial=0) > 1e-6:
-        raise DataError(f"{where}: the last row of transform_matrix is not 0 0 0 1; exchange its rows and columns")
+        raise DataError(f"{where}: the last row of its matrix is not 0 0 0 1; exchange rows and columns")
     axes = pose[:3, :3]
     if (scale := float(np.cbrt(np.linalg.det(axes)))) < 0 or np.abs(axes.T @ axes / scale**2 - np.eye(3)).max() > 0.1:
-        raise DataError(f"{where}: transform_matrix is no camera pose, as its first three columns are not a rotation")
+        raise DataError(f"{where}: its matrix is no camera pose, as the first three columns are not a rotation")
     return pose if abs(scale - 1) <= 1e-3 else np.hstack([pose[:, :3] / scale, pose[:, 3:]])  # rounded ones stay
 
 

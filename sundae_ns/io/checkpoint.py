@@ -92,7 +92,7 @@ def _compact(value: Any) -> Any:
 
 def read(path: Path) -> dict[str, Any]:
     """A checkpoint of nerfstudio's trainer, on the CPU. No code in it runs; ``CheckpointError`` if it is bad."""
-    with reading(path, "a nerfstudio checkpoint", CheckpointError, remedy="give another file"), path.open("rb") as file:
+    with reading(path, "a checkpoint", CheckpointError, remedy="give another file"), regular(path).open("rb") as file:
         check_whole(file)
         return _loaded(file)
 
@@ -117,7 +117,7 @@ def newest_whole(folder: Path) -> tuple[Path, list[str]]:
 def read_newest(folder: Path) -> tuple[Path, dict[str, Any]]:
     """The newest whole checkpoint of a folder or a run, and its contents, also while a training replaces it."""
     path, file, _ = _open_newest(folder)
-    with file, reading(path, "a nerfstudio checkpoint", CheckpointError, remedy="give another file"):
+    with file, reading(path, "a checkpoint", CheckpointError, remedy="give another file"):
         return path, _loaded(file)
 
 

@@ -15,7 +15,7 @@ from sundae_ns.core.gaussians import SPLAT_NAMES, Gaussians, Sanitised, sanitise
 from sundae_ns.io import checkpoint
 from sundae_ns.io.coordinates import Direction, recentred, similarity, upward
 from sundae_ns.io.gltf import read_glb, write_glb
-from sundae_ns.io.ply import MAX_SH_DEGREE, Marks, check_gaussians, comments_of, ply_marks, read_ply, write_ply
+from sundae_ns.io.ply import STORED_SH_DEGREE, Marks, check_gaussians, comments_of, ply_marks, read_ply, write_ply
 from sundae_ns.io.sog import METAS, read_sog, write_sog, write_streamed
 from sundae_ns.io.splat import read_gsplat, read_ksplat, read_splat
 from sundae_ns.io.spz import read_spz, write_spz
@@ -133,9 +133,8 @@ def read_gaussians(path: Path) -> tuple[dict[str, Tensor], bool]:
     as harmonics; and whether coordinates are those of nerfstudio's model, not of a capture. ``CheckpointError`` for no
     such file, no Gaussians, or another format; ``PackError`` for a damaged pack.
     """
-    remedy = "give a .ckpt file, the folder of them, or a .ply"
     if not path.exists():
-        raise CheckpointError(f"{path} does not exist; {remedy}")
+        raise CheckpointError(f"{path} does not exist; give a .ckpt file, the folder of them, or a .ply")
     if kind_of_gaussians(path) is not None:
         try:
             sanitised, marks = read_gaussian_file(path)
@@ -156,12 +155,10 @@ def read_gaussians(path: Path) -> tuple[dict[str, Tensor], bool]:
         return dict(gaussians), (packed.meta.get("source") or {}).get("model_frame") is not False
     if (reason := unread(path)) is not None:
         raise CheckpointError(f"{path} {reason}")
-    if not path.is_dir():
-        loaded = checkpoint.read(path)
-    elif checkpoint.checkpoints(checkpoint.folder_of(path)):
+    if path.is_dir():
         path, loaded = checkpoint.read_newest(path)
     else:
-        raise CheckpointError(f"{path} holds no checkpoint; {remedy}")
+        loaded = checkpoint.read(path)
     return dict(usable(checkpoint.gaussians_of(loaded, path), path).gaussians.as_harmonics()), True
 
 
@@ -196,7 +193,7 @@ def _prepared(params: Mapping[str, Tensor], kind: str, marks: Marks, upright: bo
         turn = UPRIGHT[:, :3].double().numpy()
         up, offset = (vector and tuple((turn @ vector).tolist()) for vector in (marks.up or _MODEL_UP, marks.offset))
         marks = marks._replace(in_model_frame=False, up=up, offset=offset)
-    if kind != ".ply" and sh_degree(gaussians["features_rest"]) > MAX_SH_DEGREE:
-        _log.warning("a %s holds no harmonics above SH degree %d; a .ply does", kind, MAX_SH_DEGREE)
-        gaussians["features_rest"] = gaussians["features_rest"][:, : (MAX_SH_DEGREE + 1) ** 2 - 1]
+    if kind != ".ply" and sh_degree(gaussians["features_rest"]) > STORED_SH_DEGREE:
+        _log.warning("a %s holds no harmonics above SH degree %d; a .ply does", kind, STORED_SH_DEGREE)
+        gaussians["features_rest"] = gaussians["features_rest"][:, : (STORED_SH_DEGREE + 1) ** 2 - 1]
     return gaussians, marks

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sundae_ns.core.covariance import rotation_matrices
-from sundae_ns.core.errors import reading, regular
+from sundae_ns.core.errors import DataError, reading, regular
 from sundae_ns.core.files import replacing
 from sundae_ns.core.gaussians import SH_C0, sh_degree
 from sundae_ns.io.budget import afford, afford_gaussians, parsed_json
@@ -46,6 +46,7 @@ _SRGB = "srgb_rec709_display"
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
 _MOST_NODES, _PLACED_AT_ONCE = 10_000, 1000  # nodes of a scene, and instances; transforms that are applied at once
+_MOST_BYTES = (1 << 32) - (1 << 20)  # of a buffer: a file states its length in 32 bits, and has a document too
 _READ, _PLACE = 1 << 18, 1 << 12  # bytes that take as long as to read a primitive, and as to place it
 _TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0  # OpenGL's numbers: types, a target, a mode
@@ -77,6 +78,8 @@ def write_glb(path: Path, params: Mapping[str, Tensor], marks: Marks = UNMARKED)
     }
     rest = gaussians["features_rest"].unbind(dim=1)
     attributes |= dict(zip(semantics(sh_degree(gaussians["features_rest"])), rest, strict=True))
+    if (size := sum(value.nbytes for value in attributes.values())) > _MOST_BYTES:
+        raise DataError(f"{path} would hold {size:,} bytes, and a .glb at most {_MOST_BYTES:,}; write a .sog or .ply")
     stated = {name: value for name, value in zip(_MARKS, marks, strict=True) if value}
     accessors: list[dict[str, Any]] = []
     buffer_views: list[dict[str, int]] = []

@@ -45,7 +45,7 @@ from sundae_ns.io.coordinates import Direction, recentred
 
 MODEL_FRAME = "Coordinates: nerfstudio model"  # comment of files in the coordinates of nerfstudio's model
 LEAST_OPACITY = 1e-6  # of a byte of 0, and what one of 255 lacks to 1, so that their logits are finite
-MAX_SH_DEGREE = 3  # of .spz, .sog and .glb
+STORED_SH_DEGREE = 3  # most of .spz, .sog and .glb
 _COLUMNS = {
     "means": ("x", "y", "z"),
     "features_dc": ("f_dc_0", "f_dc_1", "f_dc_2"),
@@ -114,8 +114,8 @@ def checked(path: Path, params: Mapping[str, Tensor]) -> dict[str, Tensor]:
         raise DataError(f"the scene has no Gaussians, which a {path.suffix} cannot store; check the run")
     if not all(bool(value.isfinite().all()) for value in (*gaussians.values(), gaussians["scales"].exp())):
         raise DataError("some values are NaN or infinite; drop those Gaussians first (finite_mask)")
-    if gaussians["features_rest"].shape[1] > (MAX_SH_DEGREE + 1) ** 2 - 1:
-        raise DataError(f"a {path.suffix} stores SH degrees up to {MAX_SH_DEGREE}; cut features_rest, or write a .ply")
+    if gaussians["features_rest"].shape[1] > (STORED_SH_DEGREE + 1) ** 2 - 1:
+        raise DataError(f"{path.suffix} stores SH degrees up to {STORED_SH_DEGREE}; cut features_rest, or write a .ply")
     # Opacities beyond these logits are 0 and 1 in every format, and would overflow before they are.
     gaussians["opacities"] = gaussians["opacities"].clamp(-30.0, 30.0)
     # Normalise in float64: the square of 1e-30 is 0 in float32.

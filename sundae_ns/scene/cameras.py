@@ -105,7 +105,7 @@ def _of_path(entry: Any, content: dict[str, Any], where: str) -> Pinhole:
     width, height = (side(content.get(f"render_{name}"), f"render_{name}", where) for name in ("width", "height"))
     flat = entry.get("camera_to_world") if isinstance(entry, dict) else None
     rows = [flat[k : k + 4] for k in range(0, 16, 4)] if isinstance(flat, list) and len(flat) == 16 else flat
-    pose = matrix(rows, (4,), "camera_to_world", where)
+    pose = rigid(matrix(rows, (4,), "camera_to_world", where), where)
     if not (fov := finite(entry.get("fov", 60.0), "fov", where, positive=True)) < 180:
         raise DataError(f"{where}: fov is {fov:g}; it must be below 180 degrees")
     focal = height / 2 / math.tan(math.radians(fov) / 2)

@@ -22,7 +22,7 @@ from tempfile import TemporaryDirectory
 from PIL import Image
 
 from sundae_ns.core.camera import Camera
-from sundae_ns.core.errors import ConfigError, MemoryExhaustedError, PackError, reading
+from sundae_ns.core.errors import ConfigError, MemoryExhaustedError, PackError, reading, regular
 from sundae_ns.core.files import write_files
 from sundae_ns.core.values import whole
 from sundae_ns.io.pack.config import PackConfig
@@ -89,8 +89,8 @@ def write_page(path: Path, *scenes: Shown, views: Mapping[str, View] | None = No
 def opened_page(page: Path) -> Iterator[Path]:
     """The first scene in a page of one file, as a packed file for a while; ``PackError`` if there is none."""
     with reading(page, "a page with its scene", PackError, remedy="give the scene that it was made of"):
-        text = page.read_text(encoding="utf-8").partition('class="scene"')[2].partition(">")[2].partition("<")[0]
-        content = base64.b64decode(text or "?", validate=True)
+        found = re.search('class="scene"[^>]*>([^<]+)', regular(page).read_text(encoding="utf-8"))
+        content = base64.b64decode(found[1] if found else "?", validate=True)
     with TemporaryDirectory() as folder:
         packed = Path(folder, f"{page.stem}.sundae")
         packed.write_bytes(content)

@@ -73,14 +73,14 @@ def test_only_files_and_folders_are_replaced(here):
     check_folder(here / "empty", reads=[], overwrite=False)
 
 
-READING = ["prune in -o x.ply", "export in -o x.spz", "export run -o x.spz", "pack in -o x.sundae"]
+READING = ["prune in -o x.ply", "export in -o x.spz", "export run -o x.spz", "pack in.html -o x.sundae"]
 
 
 @pytest.mark.parametrize("words", [*READING, "compare in -o x", "compare run -o x"])
 @pytest.mark.parametrize("kind", ["pipe", "device"])
 def test_what_is_no_file_is_refused_at_once(here, capsys, words, kind):
     (here / "run" / "nerfstudio_models").mkdir(parents=True)
-    for path in ("in", "run/config.yml", "run/nerfstudio_models/step-000000001.ckpt"):
+    for path in ("in", "in.html", "run/config.yml", "run/nerfstudio_models/step-000000001.ckpt"):
         if kind == "pipe":
             os.mkfifo(here / path)
         else:

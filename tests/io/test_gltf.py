@@ -261,7 +261,9 @@ def test_accessors_that_share_their_bytes_are_refused_before_they_grow(tmp_path)
     refused(sn.load, tmp_path / "a.glb", "would unpack to|none is finite")
 
 
-def test_a_field_that_does_not_fit(tmp_path):
-    with pytest.raises(DataError, match="up to 3"):
-        write_glb(tmp_path / "a.glb", small_field(4, 4))
+def test_a_field_that_does_not_fit(tmp_path, monkeypatch):
+    monkeypatch.setattr("sundae_ns.io.gltf._MOST_BYTES", 1000)
+    for n, degree, words in ((4, 4, "up to 3"), (18, 0, "would hold 1,080 bytes, and a .glb at most 1,000; write a")):
+        with pytest.raises(DataError, match=words):
+            write_glb(tmp_path / "a.glb", small_field(n, degree))
     assert not list(tmp_path.iterdir())

@@ -73,7 +73,7 @@ def test_what_is_not_whole_is_passed_over(tmp_path, harm):
     assert path == tmp_path / name(20)
     assert checkpoint.newest_step(tmp_path) == 20
     assert [name(30) in line for line in passed_over] == [True]
-    with pytest.raises(CheckpointError, match="is not a nerfstudio checkpoint"):
+    with pytest.raises(CheckpointError, match="is not a checkpoint"):
         checkpoint.read(tmp_path / name(30))
     for step in (10, 20):
         harm(tmp_path / name(step))
