@@ -31,7 +31,7 @@ case $1 in
     done < $H/$2
     ls $J | wc -l ;;
   look)
-    tail -n 12 /tmp/logs/queue.log; bash lab/look.sh; tar -czf $OUT/out.tgz --exclude="*.ckpt" --exclude="events.*" --exclude="*.sundae" --exclude="*.jpg" -C /tmp out logs ;;
+    tail -n 12 /tmp/logs/queue.log; bash lab/look.sh; tar -czf $OUT/out.tgz --exclude="*.ckpt" --exclude="*.tmp" --exclude="events.*" --exclude="*.sundae" --exclude="*.jpg" -C /tmp out logs ;;
   wait)
     touch $J/END; SECONDS=0
     until grep -q "all done" /tmp/logs/queue.log || [ $SECONDS -gt $2 ]; do sleep 1; done

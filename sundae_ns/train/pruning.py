@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 
 USUAL_SHARE = 0.1  # Share that a prune keeps unless it is told otherwise
 MANY_VIEWS = 32  # With as many, counts are tried, and no length is: captures of 43 training views gain to the end
-FEW_SHARE, USUAL_VIEWS = 0.05, 24  # Least share of the Gaussians that few views keep, and as many keep the usual share
+USUAL_VIEWS = 16  # Up to as many keep the usual share of the Gaussians, others below MANY_VIEWS more in proportion
 DROPPED, FEW_DROPPED = 0.1, 0.2  # Share of the Gaussians that a step after the prune leaves out; with few views
 NEVER = -1  # Value of state["pruned_at"] before the first prune
 UNPRUNED = {"pruned_at": NEVER, "num_prunes": 0, "peak": 0}  # Running state at the start; the peak is of Gaussians
@@ -155,7 +155,7 @@ class PruningConfig(PruneRule):
 
 def usual_share(num_views: int) -> float:
     """Share of the Gaussians that a prune keeps where trials cannot decide."""
-    return USUAL_SHARE if num_views >= MANY_VIEWS else max(FEW_SHARE, USUAL_SHARE * num_views / USUAL_VIEWS)
+    return USUAL_SHARE * (max(num_views / USUAL_VIEWS, 1) if num_views < MANY_VIEWS else 1)
 
 
 def write_record(run: TrainingRun, name: str, record: Any) -> None:

@@ -232,8 +232,8 @@ def test_trials_decide_how_many_stay_and_the_prune_waits_for_them():
     # Without trials the bytes of a Gaussian are those of other captures.
     limited = PruningConfig(keep_ratio=None, max_bytes=4 * PACKED_BYTES)
     assert [limited.target(60, {**UNPRUNED, COUNT: chosen}) for chosen in (7, 0)] == [7, 4]
-    shares = [usual_share(views) for views in (1, 7, 12, 13, 24, 31, 32, 99)]
-    assert shares == pytest.approx([0.05, 0.05, 0.05, 0.13 / 2.4, 0.1, 0.31 / 2.4, 0.1, 0.1])
+    shares = [usual_share(views) for views in (1, 7, 16, 17, 24, 31, 32, 99)]
+    assert shares == pytest.approx([0.1, 0.1, 0.1, 0.17 / 1.6, 0.15, 0.31 / 1.6, 0.1, 0.1])
 
 
 def test_a_prune_in_one_shot_adds_none_that_lack_and_a_cap_may_be_the_target():
