@@ -1,1 +1,1 @@
-"""What everything stands on: errors, Gaussians, cameras, metrics, whole files."""
+"""The base of all rooms: errors, Gaussians, cameras, metrics, atomic files."""

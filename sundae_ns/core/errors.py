@@ -26,7 +26,7 @@ _REASONS = {
     errno.EISDIR: "it is a folder; name a file",
     errno.ENOENT: "a file or a folder is missing; check the path",
 }
-# What stands in the place of a file that was not fetched, by its first bytes.
+# First bytes of files that stand in for one that was not fetched.
 _STAND_INS = {b"version https://git-lfs": "is a pointer of Git LFS; fetch the file itself with `git lfs pull`"}
 _STAND_INS |= dict.fromkeys((b"<!doctype html", b"<html"), "is a web page; download the file that it shows or names")
 
@@ -120,7 +120,7 @@ def regular(path: Path) -> Path:
 
 
 def rank_ended(error: BaseException) -> str:
-    """What ended a rank, which stopped the others, by an exception of ``torch.multiprocessing``; and the remedy."""
+    """Cause and remedy of a rank's end, which stopped the others, from an exception of ``torch.multiprocessing``."""
     rank, signal = getattr(error, "error_index", 0), getattr(error, "signal_name", None)
     if (last := (str(error).strip().splitlines() or [""])[-1]).startswith(__name__ + "."):
         return f"rank {rank}: {last.partition(': ')[2]}"  # our own errors already name the remedy

@@ -183,7 +183,7 @@ class Sanitised(NamedTuple):
         return self.limits + self.flat + self.unrotated > 0
 
     def summary(self) -> str:
-        """What was clamped and dropped, as part of a sentence; empty if nothing was."""
+        """A clause that counts clamped and dropped Gaussians; empty if nothing was changed."""
         kinds = {"opacity 0 or 1": self.limits, "width 0": self.flat, "rotation 0": self.unrotated}
         named = " and ".join(f"{number:,} with {name}" for name, number in kinds.items() if number)
         parts = [f"clamped {named} to finite values"] if named else []

@@ -44,7 +44,7 @@ def floats(values: Any, name: str, *, colors: bool = False) -> Tensor:
 
     With ``colors``, values of 8 or 16 bits become [0, 1] by their type, and others have to be there.
     """
-    given = values if isinstance(values, Tensor) else np.ma.filled(values, np.nan)  # what is masked is no value
+    given = values if isinstance(values, Tensor) else np.ma.filled(values, np.nan)  # masked entries have no value
     kind = str(given.dtype).removeprefix("torch.") if isinstance(given, Tensor) else given.dtype.name
     if not kind.startswith(("float", "bfloat", "int", "uint")) or (kind in _WHITE and not colors):
         raise DataError(f"{name} has values of type {kind}; give floating-point numbers")

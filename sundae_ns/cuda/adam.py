@@ -22,7 +22,7 @@ OPTIONS = (f"-DPER_THREAD={_PER_THREAD}",)  # Compiler options of ``adam.cu``
 
 
 class Update(NamedTuple):
-    """What a step of Adam changes of one parameter, and its gradient. The first four have one shape and layout."""
+    """Tensors of one parameter that a step of Adam updates or reads. The first four have one shape and layout."""
 
     value: Tensor  # the parameter, float32
     gradient: Tensor

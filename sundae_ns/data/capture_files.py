@@ -51,7 +51,7 @@ class Placed(NamedTuple):
 
     @property
     def again(self) -> str:
-        """What to photograph again, as the end of a sentence."""
+        """Advice on photos to take again, as the end of a sentence."""
         if not self.placed or not self.left_out:
             return "add sharp photos that overlap by two thirds"
         at = {name: index for index, name in enumerate(sorted([*self.placed.values(), *self.left_out]))}
@@ -88,7 +88,7 @@ def write_images(photos: Sequence[Photo], folder: Path, warn: Warn, advance: Adv
             with writing(f"cannot write {path}"):
                 path.parent.mkdir(parents=True, exist_ok=True)
                 partial = path.with_name(f"{path.name}.partial")
-                image, exif = upright(photo)  # decodes: what is broken is named before the work of hours
+                image, exif = upright(photo)  # decodes, so that a broken photo is named before hours of work
                 if photo.as_it_is:
                     shutil.copyfile(photo.path, partial)
                 elif photo.suffix == ".png":

@@ -159,7 +159,7 @@ def model_options(path: Path) -> dict[str, Any]:
 
 
 def orientation_of(path: Path) -> Any:
-    """How a run's data parser has turned the capture; None if it does not say."""
+    """Orientation method of a run's data parser; None if it states none."""
     return _value(path, "pipeline", "datamanager", "dataparser", "orientation_method")
 
 

@@ -95,7 +95,7 @@ def upward(means: Tensor, convention: Direction) -> tuple[Direction, bool]:
     """Upward direction of centres ``[N, 3]``, and whether the scene's ground shows it, not the ``convention``.
 
     The ground is the largest of planes through three centres (RANSAC; Fischler and Bolles, 1981), above which are most
-    others. Within 45 degrees of the convention it has at least a fifth of the centres, of +z or +y two.
+    others. A ground within 45 degrees of the convention holds at least a fifth of the centres; of +z or +y, two fifths.
     """
     points = _sample(means, 1024).astype(np.float32)
     if len(points) < 100:

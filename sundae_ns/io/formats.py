@@ -77,7 +77,7 @@ def kind_of_gaussians(path: Path) -> Kind | None:
 
 
 def unread(path: Path) -> str | None:
-    """What a scene is that this program does not read, and how to convert it; None for any other path.
+    """The kind of a scene that this program does not read, and how to convert it; None for any other path.
 
     >>> unread(Path("garden.lcc"))
     'is a scene of XGRIDS; convert it to .ply with SuperSplat or splat-transform'

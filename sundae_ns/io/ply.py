@@ -85,7 +85,7 @@ _FOREIGN = {
 
 
 class Marks(NamedTuple):
-    """What a file states of its scene."""
+    """Facts that a file states of its scene."""
 
     antialiased: bool = False
     in_model_frame: bool = False  # coordinates are those of nerfstudio's model, not of a capture

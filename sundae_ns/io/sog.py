@@ -241,7 +241,7 @@ def _file_entry(folder: Path, name: str) -> bytes:
 
 
 def _bundled(bundle: zipfile.ZipFile, size: int, *, inner: bool = False) -> tuple[Entry, bool]:
-    """What reads an entry of a zip, whose files may be in a folder or in another zip; and whether it is streamed."""
+    """A reader of entries of a zip, whose files may be in a folder or in another zip; and whether it is streamed."""
     names = {name: PurePosixPath(name.replace("\\", "/")).name for name in bundle.namelist()}  # some are of Windows
     main = STREAMED if STREAMED in names.values() else META
     metas = [name for name, last in names.items() if last == main]

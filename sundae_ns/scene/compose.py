@@ -23,7 +23,7 @@ from sundae_ns.pruning.floaters import STRENGTH, floater_odds
 from sundae_ns.scene.prune_scene import weights_in
 from sundae_ns.scene.scene import Scene, unit, usable_cameras, within
 
-_SIDE = 512  # longest side of the images that tell what is seen, pixels; the next two were measured with it
+_SIDE = 512  # longest side of the images that measure visibility, pixels; the next two were measured with it
 _FAINT = 0.01  # weight as a share of the mean, below which a Gaussian is hardly seen; 0 tells captures apart less well
 HARDLY_SEEN = 0.17  # share of such Gaussians: up to 0.10 in the captures tried, in other coordinates from 0.27 on
 LEAST_SEEN = 0.92  # share of the Gaussians that cameras of a prune see, else they may be in other coordinates: a guess
@@ -62,7 +62,7 @@ def transform(
         raise ConfigError(f"scale is {scale}; give a positive number")
     shift, meta = numbers(translation, "translation", (3,)), dict(scene.meta)
     if scene.offset is not None:
-        # What is near the origin stays there, for the digits of float32.
+        # Gaussians near the origin stay there, for the digits of float32.
         offset = scale * turn @ torch.tensor(scene.offset, dtype=torch.float64) + shift
         shift = torch.zeros(3, dtype=torch.float64)
         meta["frame"] = {"transform": torch.cat([torch.eye(3), -offset[:, None]], dim=1).tolist(), "scale": 1.0}
@@ -220,7 +220,7 @@ def box_of(means: Tensor, weights: Tensor, share: float = 0.99) -> list[float]:
 
 
 def for_cleaning(cameras: Sequence[Camera]) -> list[Camera]:
-    """The cameras with images of at most 512 pixels a side, which tell what is seen at all."""
+    """The cameras with images of at most 512 pixels a side, which suffice to tell whether a Gaussian is seen."""
     return [camera.zoomed(min(_SIDE / max(camera.width, camera.height), 1.0)) for camera in cameras]
 
 

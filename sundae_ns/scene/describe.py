@@ -1,4 +1,4 @@
-"""What a scene holds, and what cameras see of it."""
+"""Facts of a scene and its file, and the share of it that cameras see."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from sundae_ns.scene.prune_scene import at_most, weights_in
 from sundae_ns.scene.scene import Scene, image_of, render
 from sundae_ns.scene.virtual_cameras import by_device, virtual_cameras
 
-HELD_OUT = 16  # cameras that tell what a change costs
+HELD_OUT = 16  # cameras that measure the loss of a change
 PIXELS = {"cpu": 1 << 18, "cuda": 1 << 20}  # most of their images, by the device
-LOOKING = 64  # virtual cameras that tell what is seen of a scene without cameras
+LOOKING = 64  # virtual cameras that measure visibility in a scene without cameras
 _PRODUCER = re.compile(rb'(?im)"generator"\s*:\s*"([^"]{1,200})"|^comment ([^\r\n]* (?:by|from) [^\r\n]{1,200})')
 
 
 def held_out_cameras(scene: Scene, cameras: Sequence[Camera], count: int = HELD_OUT, *, seed: int = 0) -> list[Camera]:
-    """At most ``count`` cameras, evenly spaced among some; without any, virtual ones that no prune of the seed sees."""
+    """At most ``count`` of the cameras, evenly spaced; without any, virtual ones that no prune of this seed uses."""
     if not cameras:
         return virtual_cameras(scene, count, seed=seed + 1)
     return [at_most(cameras[i], by_device(PIXELS, scene.device)) for i in spread(len(cameras), count)]

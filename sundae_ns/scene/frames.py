@@ -187,7 +187,7 @@ class FrameReplay:
         return images
 
     def _key(self, source: GaussianSource, camera: Camera, settings: RenderSettings) -> object:
-        """What a recorded frame has fixed. It reads the Gaussians at their addresses."""
+        """Key of a recorded frame: everything that the recording fixes. It reads the Gaussians at their addresses."""
         gaussians = source.gaussians
         addresses = tuple((name, value.data_ptr(), value.shape) for name, value in gaussians.items())
         if addresses != self._gaussians:

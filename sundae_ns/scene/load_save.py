@@ -119,7 +119,7 @@ def save(scene: Scene, path: Path | str, *, upright: bool = False, config: PackC
 
 
 def marks_of(scene: Scene) -> Marks:
-    """What a file of Gaussians may state of a scene."""
+    """The marks of a scene that a file of Gaussians may state."""
     return Marks(scene.antialiased, scene.in_model_frame, scene.up, scene.offset)
 
 

@@ -61,13 +61,13 @@ def page(scenes: Scene | Mapping[str, Scene], path: Path | str, *, views: Mappin
 
 
 def shown_as(name: str, scene: Scene, config: PackConfig | None = None) -> Shown:
-    """What a page shows of a scene, packed with the settings ``config``, by default the default ones."""
+    """Name, scene and packed file for a page; ``config`` are the settings of the pack, by default ``PackConfig()``."""
     scene = opening(scene)
     return name, scene, packed_of(scene, config)
 
 
 def packed_of(scene: Scene, config: PackConfig | None = None) -> bytes:
-    """The packed file of a scene, by default with default settings."""
+    """The packed file of a scene; ``config`` is by default ``PackConfig()``."""
     from sundae_ns.io.pack.packed_scene import fit_scene, pack_bytes  # their encoder needs a compiler
     from sundae_ns.scene.packing import contents_of
 

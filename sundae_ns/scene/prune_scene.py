@@ -1,7 +1,7 @@
 """Pruning of a scene by what cameras see of it, without photographs, also to a size.
 
-A file of a size holds more Gaussians, or more bits for each. Of a few :class:`Form`, each with as many Gaussians as fit
-by samples, the one whose images are nearest to the full scene's is taken, fitted, and rounded or counted to the size.
+A file of a given size holds more Gaussians, or more bits for each. :func:`prune_to_bytes` takes the :class:`Form` whose
+images are nearest to the full scene's. It fits the Gaussians, then adjusts their rounding or their number to the size.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from sundae_ns.scene.scene import Scene, measure, render, usable_cameras, within
 from sundae_ns.scene.virtual_cameras import at_most, by_device, of_unit_size, resized, split, virtual_cameras
 
 REFIT = {"cpu": (192, 1, 0.7), "cuda": (128, 4, 1.0)}  # steps of a refit, images of each, and factor of its rates
-REFIT_PIXELS, MOST_PIXELS = 1 << 18, 1 << 22  # most pixels of an image of a refit, and of one that tells what is seen
-SAMPLED = 64, 8192  # random Gaussians of two files, which tell the bytes of each more one
-LEAST, AIM = 0.97, 0.985  # shares of the size: what is near enough, and what each file aims at
+REFIT_PIXELS, MOST_PIXELS = 1 << 18, 1 << 22  # most pixels of an image of a refit, and of one that measures visibility
+SAMPLED = 64, 8192  # random Gaussians of two files, whose difference gives the bytes of each
+LEAST, AIM = 0.97, 0.985  # shares of the size: the least that is accepted, and the aim of each file
 JUDGES, PIXELS = 8, 1 << 16  # cameras that compare fits and forms, and most pixels of their images for forms
 MOST_FILES = 8  # of the last search
 T = TypeVar("T")
@@ -129,7 +129,7 @@ def prune_with_mask(
 
 
 def fitted(pruned: PrunedScene, full: Scene, cameras: Sequence[Camera], rule: PruneRule, **options: Any) -> PrunedScene:
-    """What is kept of a finite scene, fitted by :func:`refit` with its ``options`` if the rule and the cameras do."""
+    """A pruned scene, fitted to the images of the finite scene ``full`` by :func:`refit`, if the rule asks for it."""
     if pruned.seen_share is None or not rule.refits:
         return pruned
     unit, scaled, size = of_unit_size(full, cameras)
@@ -254,7 +254,7 @@ def count_for_drop(
 
 
 class Form(NamedTuple):
-    """How a file states Gaussians."""
+    """The form in which a file states Gaussians."""
 
     degree: int = MAX_SH_DEGREE  # Most SH degree
     power: float = 0.0  # Steps of a pack: powers of two of the usual ones
@@ -346,7 +346,7 @@ def prune_to_bytes(
         return fitted(stated, scene, cameras, rule, images=images, console=console)
 
     def sized(change: Callable[[PrunedScene], PrunedScene], near: PrunedScene) -> PrunedScene:
-        """What has as many Gaussians as fit, changed before it is written; the search begins ``near`` it."""
+        """The scene with as many Gaussians as fit after a ``change``; the search begins ``near`` it."""
         halvings, size = math.log2(n / len(near.scene)), partial(bytes_of, form=form)
         powers = (0.0, math.log2(n))
         return largest(lambda power: change(cut(max(round(n / 2**power), 1))), size, most, halvings, powers, 1.0)

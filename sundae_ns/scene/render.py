@@ -28,7 +28,7 @@ NEAR_PLANE = 0.01  # distance of the near plane, world units
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """What images depend on beside Gaussians and view."""
+    """Everything that an image depends on beside Gaussians and camera."""
 
     backend: Backend
     active_sh_degree: int = MAX_SH_DEGREE  # Highest SH degree in use, at most that of the Gaussians

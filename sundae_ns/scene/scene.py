@@ -182,7 +182,7 @@ class Scene:
 
     @property
     def offset(self) -> Direction | None:
-        """What opening a file subtracted from survey coordinates, and what writing one adds; None for nothing."""
+        """Offset that opening a file subtracts from survey coordinates, and that writing one adds; None without one."""
         frame = {} if self.in_model_frame else self.meta.get("frame", {})
         rows = np.array(frame.get("transform", np.zeros((3, 4))), np.float64)[:3]
         if frame.get("scale") != 1 or not np.array_equal(rows[:, :3], np.eye(3)):
@@ -293,7 +293,7 @@ def usable_cameras(cameras: Any) -> tuple[Camera, ...]:
 
 
 def _are_pinholes(views: Tensor, K: Tensor) -> bool:
-    """Whether matrices ``[V, 4, 4]`` and ``[V, 3, 3]`` are of such a form that rasterisers read all of them."""
+    """Whether matrices ``[V, 4, 4]`` and ``[V, 3, 3]`` are pinholes without skew, of which rasterisers read all."""
     axes, eye = views[:, :3, :3], torch.eye(4, device="cpu")
     plain = torch.equal(K * K.new_tensor([[1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]]), K)
     turned = ((axes @ axes.mT - eye[:3, :3]).abs() < 0.25).all() & (axes.det() > 0).all() & views.isfinite().all()

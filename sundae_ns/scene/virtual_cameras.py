@@ -47,9 +47,9 @@ def by_device(values: Mapping[str, T], device: torch.device) -> T:
 def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: int | None = None) -> list[Camera]:
     """Cameras that see a scene as a visitor would, for scenes without cameras.
 
-    Training splits Gaussians until each covers few pixels of the photographs, so from their places all look small.
-    Half of the cameras are the best of some draws and moves by the mean logarithm of the angle of the Gaussians in
-    small images; the others by mean and deviation, and look at random Gaussians in the end.
+    Training splits Gaussians until each covers few pixels of the photographs, so they look small from where these were
+    taken. Half of the cameras are drawn and moved until the mean logarithm of the Gaussians' angles, in small images,
+    is low. For the others mean and deviation are low; in the end these look at random Gaussians.
 
     Args:
         scene: its finite Gaussians count.
