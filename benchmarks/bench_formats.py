@@ -35,8 +35,6 @@ from sundae_ns.plugin.finished_runs import Opened, load_model, load_run
 from sundae_ns.scene.page import packed_of
 
 COLUMNS = tuple("capture method format program bytes psnr ssim primitives seed command".split())
-PLACE = ("capture", "method", "format", "program", "seed")
-"""Columns that name a row."""
 OURS = "sundae_ns"
 OTHER = "splat-transform"
 
@@ -105,7 +103,7 @@ def main() -> int:
     scene = sn.load(options.run, device=opened.model.device)
     with tempfile.TemporaryDirectory() as name:
         files = packed_files(options.run, scene, Path(name), options.data, options.splat_transform)
-        rows = Rows(options.out, COLUMNS, PLACE)
+        rows = Rows(options.out, COLUMNS, ("capture", "method", "format", "program", "seed"))
         for row in rows_of(opened, files, scene):
             rows.put(row)
     return 0

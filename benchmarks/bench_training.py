@@ -33,19 +33,13 @@ from sundae_ns.core.timing import now
 ARMS = ("splatfacto", "sundae", "sundae-fast")
 
 
-def steps_of(options: argparse.Namespace, arm: str) -> int:
-    """Length of a training: by default that of the method."""
-    config: Any = all_methods[arm]
-    return int(options.steps or config.max_num_iterations)
-
-
-def trainer_of_arm(options: argparse.Namespace, arm: str, out: str) -> Any:
+def trainer_of_arm(options: argparse.Namespace, arm: str, steps: int, out: str) -> Any:
     """A trainer that is set up."""
     words = ["--viewer.quit-on-train-completion", "True", "--pipeline.datamanager.cache-images", "gpu"]
     if arm != "splatfacto":
         words += ["--pipeline.model.evaluate-prune", "False"]
     parser, capture = parser_of(options.capture), options.capture
-    job = Job(arm, "whole", capture.name, arm, str(capture), arm, steps_of(options, arm), options.seed)
+    job = Job(arm, "whole", capture.name, arm, str(capture), arm, steps, options.seed)
     job = replace(job, options=(*words, *options.option), parser=parser)
     return trainer_of(configure(job, Path(out))[0])[0]
 
@@ -63,10 +57,10 @@ def quality(trainer: Any) -> tuple[float, float]:
     return tuple(torch.tensor(figures).mean(dim=0).tolist())
 
 
-def timed(options: argparse.Namespace, arm: str, out: str) -> dict[str, Any]:
+def timed(options: argparse.Namespace, arm: str, steps: int, out: str) -> dict[str, Any]:
     """Train with the clock running; the figures of the row."""
     sys.stdout = sys.stderr  # for what nerfstudio prints in this process
-    trainer = trainer_of_arm(options, arm, out)
+    trainer = trainer_of_arm(options, arm, steps, out)
     curve: list[list[float]] = []
     spent = 0.0
 
@@ -109,9 +103,10 @@ def main() -> None:
     command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
     commit = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
     for arm in options.arms:
+        steps = options.steps or dict[str, Any](all_methods)[arm].max_num_iterations
         with TemporaryDirectory() as out, ProcessPoolExecutor(1, get_context("spawn")) as alone:
-            measured = alone.submit(timed, options, arm, out).result()
-        row = {"arm": arm, "scene": options.capture.name, "steps": steps_of(options, arm), "seed": options.seed}
+            measured = alone.submit(timed, options, arm, steps, out).result()
+        row = {"arm": arm, "scene": options.capture.name, "steps": steps, "seed": options.seed}
         row |= {**measured, "gpu": torch.cuda.get_device_name(0), "commit": commit or None}
         print(json.dumps(row), flush=True)
         if options.output is not None:

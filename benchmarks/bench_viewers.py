@@ -18,7 +18,7 @@ import json
 import math
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -99,44 +99,39 @@ def central(scene: PackedScene) -> PackedScene:
     return replace(scene, gaussians={name: value[keep] for name, value in scene.gaussians.items()})
 
 
-class _Quiet(SimpleHTTPRequestHandler):
+class Quiet(SimpleHTTPRequestHandler):
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002
         pass
 
 
-class Viewers:
-    """A page with the viewers, and the export and the cameras of a scene."""
-
-    def __init__(self, page: Browser, address: str, scene: PackedScene, file: str) -> None:
-        self._page, self._address, self._file = page, address, file
-        cameras = arrays_of_cameras(scene_of(scene).cameras)
-        names = ("fx", "fy", "cx", "cy", "width", "height")
-        self._sizes = cameras["sizes"].tolist()
-        self._cameras = [
-            {"pose": pose.flatten().tolist(), **dict(zip(names, [*lens, *size], strict=True))}
-            for pose, lens, size in zip(cameras["poses"], cameras["intrinsics"].tolist(), self._sizes, strict=True)
-        ]
-
-    def images(self, viewer: str, options: Options) -> list[NDArray[np.float64]]:
-        """Images ``[H, W, 3]`` of all cameras in [0, 1]."""
-        self._page.open(self._address)
-        wait_for(lambda: self._page.evaluate("typeof show") == "function", "the viewers", SECONDS)
-        words = ", ".join(json.dumps(word) for word in (viewer, self._file, self._cameras, options))
-        keep = "(found => { window.found = found; }, error => { window.found = String(error); })"
-        # Several minutes in software: the page keeps the images until they are asked for.
-        self._page.evaluate(f"window.found = null; show({words}).then{keep}; 0")
-        wait_for(lambda: bool(self._page.evaluate("found !== null")), f"images of {viewer}", SECONDS)
-        found = self._page.evaluate("found")
-        if isinstance(found, str):
-            raise RuntimeError(f"{viewer}: {found}")
-        pixels = [np.frombuffer(base64.b64decode(image), np.uint8) for image in found]
-        # WebGL begins with the lowest row.
-        return [image.reshape(h, w, 4)[::-1, :, :3] / 255 for image, (w, h) in zip(pixels, self._sizes, strict=True)]
+def images_in(
+    page: Browser, address: str, file: str, scene: PackedScene, viewer: str, options: Options
+) -> list[NDArray[np.float64]]:
+    """Images ``[H, W, 3]`` in [0, 1] of all cameras of a scene, of its export in a viewer of the page."""
+    cameras = arrays_of_cameras(scene_of(scene).cameras)
+    names, sizes = ("fx", "fy", "cx", "cy", "width", "height"), cameras["sizes"].tolist()
+    shown = [
+        {"pose": pose.flatten().tolist(), **dict(zip(names, [*lens, *size], strict=True))}
+        for pose, lens, size in zip(cameras["poses"], cameras["intrinsics"].tolist(), sizes, strict=True)
+    ]
+    page.open(address)
+    wait_for(lambda: page.evaluate("typeof show") == "function", "the viewers", SECONDS)
+    words = ", ".join(json.dumps(word) for word in (viewer, file, shown, options))
+    keep = "(found => { window.found = found; }, error => { window.found = String(error); })"
+    # Several minutes in software: the page keeps the images until they are asked for.
+    page.evaluate(f"window.found = null; show({words}).then{keep}; 0")
+    wait_for(lambda: bool(page.evaluate("found !== null")), f"images of {viewer}", SECONDS)
+    found = page.evaluate("found")
+    if isinstance(found, str):
+        raise RuntimeError(f"{viewer}: {found}")
+    pixels = [np.frombuffer(base64.b64decode(image), np.uint8) for image in found]
+    # WebGL begins with the lowest row.
+    return [image.reshape(h, w, 4)[::-1, :, :3] / 255 for image, (w, h) in zip(pixels, sizes, strict=True)]
 
 
 @contextmanager
-def opened(scene: PackedScene, kind: str) -> Iterator[Viewers]:
-    """The viewers with an export of a scene; ``kind`` is ``ply``, ``spz``, ``sog``, ``glb`` or ``lod``."""
+def opened(scene: PackedScene, kind: str) -> Iterator[Callable[[str, Options], list[NDArray[np.float64]]]]:
+    """The viewers with an export of a scene of a kind: images of all cameras by viewer and options."""
     chromium = find_chromium()
     if chromium is None or not has_packages():
         sys.exit("no Chromium or no viewers here: apt-get install chromium, then make browser")
@@ -151,11 +146,11 @@ def opened(scene: PackedScene, kind: str) -> Iterator[Viewers]:
             write_levels(site / "a", [level.gaussians for level in levels], marks_of(levels[0]))
         else:
             save(scene_of(scene), site / file)
-        with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=site)) as server:
+        with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=site)) as server:
             threading.Thread(target=server.serve_forever, daemon=True).start()
             try:
                 with Browser(chromium, width, height) as page:
-                    yield Viewers(page, f"http://127.0.0.1:{server.server_port}/", scene, file)
+                    yield partial(images_in, page, f"http://127.0.0.1:{server.server_port}/", file, scene)
             finally:
                 server.shutdown()
 
@@ -170,12 +165,12 @@ def rows(
     images = [truth["base_rgb"] for truth in truths(shown)]
     height, width, _ = images[0].shape
     about = {"scene": scene.name, "file": kind, "primitives": len(shown.gaussians["means"]), "central": center}
-    with opened(shown, kind) as viewers:
+    with opened(shown, kind) as images_of:
         for viewer, ladder in settings(kind, shown.meta["model"]["rasterize_mode"] == "antialiased").items():
             if only not in (None, viewer):
                 continue
             for name, options in ladder.items():
-                found = viewers.images(viewer, options)
+                found = images_of(viewer, options)
                 each = [psnr(image, truth) for image, truth in zip(found, images, strict=True)]
                 row = {**about, "size": f"{width}x{height}", "viewer": viewer, "setting": name, "psnr": each}
                 yield {**row, "psnr_of_all": psnr(np.stack(found), np.stack(images))}

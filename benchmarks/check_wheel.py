@@ -17,7 +17,6 @@ import shutil
 import subprocess
 import sys
 import sysconfig
-import tarfile
 import tempfile
 import tomllib
 import venv
@@ -25,7 +24,7 @@ import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-BUILD = "import sys; from setuptools import build_meta; print(getattr(build_meta, 'build_' + sys.argv[1])(sys.argv[2]))"
+BUILD = "import sys; from setuptools import build_meta; print(build_meta.build_sdist(sys.argv[1]))"
 LOOK = """
 import json, sys
 from importlib.metadata import entry_points
@@ -72,14 +71,10 @@ def build(folder: Path) -> tuple[Path, Path]:
     for name in tracked():
         (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, folder / "source" / name, follow_symlinks=False)
-    sdist = folder / run(sys.executable, "-c", BUILD, "sdist", folder, cwd=folder / "source").splitlines()[-1]
-    with tarfile.open(sdist) as archive:
-        if hasattr(tarfile, "data_filter"):  # not before Python 3.11.4
-            archive.extraction_filter = tarfile.data_filter
-        archive.extractall(folder / "unpacked")
-    (unpacked,) = (folder / "unpacked").iterdir()
-    wheel = folder / run(sys.executable, "-c", BUILD, "wheel", folder, cwd=unpacked).splitlines()[-1]
-    return sdist, wheel
+    sdist = folder / run(sys.executable, "-c", BUILD, folder, cwd=folder / "source").splitlines()[-1]
+    here = ("--quiet", "--no-deps", "--no-build-isolation")
+    run(sys.executable, "-m", "pip", "wheel", *here, "--wheel-dir", folder, sdist, cwd=folder)
+    return sdist, next(folder.glob("*.whl"))
 
 
 def missing(wheel: Path) -> list[str]:

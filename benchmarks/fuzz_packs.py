@@ -92,7 +92,6 @@ def _scene(degree: int, kind: tuple[Any, int, int] | None) -> sn.Scene:
 
 def python_verdict(path: Path) -> Verdict:
     """The verdict of Python's reader, which also makes the page of a valid file."""
-
     faulthandler.dump_traceback_later(SECONDS, exit=True, file=2)
     try:
         packed = read_scene(path)

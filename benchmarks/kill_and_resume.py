@@ -21,14 +21,12 @@ import argparse
 import json
 import random
 import shutil
-import signal
 import sys
 import tempfile
 from collections import Counter
 from collections.abc import Mapping
 from copy import deepcopy
 from functools import partial
-from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +38,7 @@ from rich.progress import track
 
 import sundae_ns as sn
 from harness import killing
-from harness.killing import Bench, command_here, train_here
+from harness.killing import ANY, Bench, command_here, train_here
 from harness.still_life import write_still_life
 from sundae_ns.core.errors import CheckpointError
 from sundae_ns.io import checkpoint
@@ -49,7 +47,6 @@ from sundae_ns.plugin.finished_runs import load_model
 
 SPREAD = 3.0
 """Decibels that a resumed run on CUDA may be below the worse of two undisturbed ones."""
-ANY = "any time"
 KILLS = {"training": 20, "trials": 10, "commands": 24}
 COMMON = """
 --experiment-name e --timestamp t --viewer.quit-on-train-completion True --viewer.websocket-host 127.0.0.1
@@ -91,25 +88,18 @@ def run_folder(config: TrainerConfig) -> Path:
     return Path(config.output_dir) / "e" / "sundae-tiny" / "t"
 
 
-def outcome(folder: Path, steps: int) -> dict[str, Any]:
-    """Result of a finished run: tensors of the final checkpoint, its records, and names of its files."""
+def outcome(folder: Path, steps: int) -> tuple[dict[str, Any], list[str]]:
+    """Result of a finished run, bits of the final checkpoint's tensors and its records; names of its files."""
     models = folder / "nerfstudio_models"
     (last,) = models.glob(f"step-*{steps - 1}.ckpt")
+    tensors = {name: value for name, value in checkpoint.read(last)["pipeline"].items() if torch.is_tensor(value)}
     prunes = json.loads((folder / "prune.json").read_text())
-    state = checkpoint.read(last)
-    return {
-        "tensors": {name: value for name, value in state["pipeline"].items() if isinstance(value, torch.Tensor)},
+    result = {
+        "tensors": {name: (value.dtype, value.shape, value.numpy().tobytes()) for name, value in tensors.items()},
         "prunes": [{key: prune[key] for key in ("step", "before", "after", "warm_up", "pruned")} for prune in prunes],
         "trials": {path.name: json.loads(path.read_text()) for path in folder.glob("trials.json")},
-        "files": sorted(path.name for path in models.iterdir()),
     }
-
-
-def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
-    """Whether two runs have the same tensors and records."""
-    tensors = a["tensors"].keys() == b["tensors"].keys()
-    tensors = tensors and all(torch.equal(a["tensors"][name], b["tensors"][name]) for name in a["tensors"])
-    return bool(tensors and a["prunes"] == b["prunes"] and a["trials"] == b["trials"])
+    return result, sorted(path.name for path in models.iterdir())
 
 
 def quality(run: Path) -> float:
@@ -131,8 +121,8 @@ def kill_trainings(kind: str, options: argparse.Namespace, bench: Bench, root: P
 
     undisturbed = [configured("first"), configured("second")]
     seconds = [bench.finish(train_here, config) for config in undisturbed][1]
-    reference, repeated = (outcome(run_folder(config), steps) for config in undisturbed)
-    repeatable = not exact or same(reference, repeated)
+    (reference, files), (repeated, _) = (outcome(run_folder(config), steps) for config in undisturbed)
+    repeatable = not exact or repeated == reference
     psnr = [] if exact else [quality(run_folder(config)) for config in undisturbed]
 
     tally: Counter[str] = Counter()
@@ -145,11 +135,8 @@ def kill_trainings(kind: str, options: argparse.Namespace, bench: Bench, root: P
         config, nth = configured(f"killed-{number}"), rng.randint(1, 5)
         folder = run_folder(config)
         models = folder / "nerfstudio_models"
-        if place == ANY:
-            start, again = partial(bench.start, train_here, config), partial(shutil.rmtree, folder)
-            killed = bench.killed_at_any_time(start, again, seconds, rng)
-        else:
-            killed = bench.ended(bench.start(train_here, config, place, nth)) == -signal.SIGKILL
+        start = partial(bench.start, train_here, config, nth=nth)
+        killed = bench.killed(start, place, partial(shutil.rmtree, folder), seconds, rng)
         try:
             done = int(checkpoint.newest_whole(models)[0].stem.partition("-")[2]) + 1
             tally["resumed" if done < steps else "killed after the last save"] += 1
@@ -159,12 +146,12 @@ def kill_trainings(kind: str, options: argparse.Namespace, bench: Bench, root: P
         if done < steps:
             config.max_num_iterations, config.load_dir = steps - done, models if done else None
             bench.finish(train_here, config)
-        result = outcome(folder, steps)
+        result, left = outcome(folder, steps)
         one_prune = len(result["prunes"]) == 1 and result["prunes"][0]["step"] == reference["prunes"][0]["step"]
-        clean = done == steps or result["files"] == reference["files"]
+        clean = done == steps or left == files
         if not exact:
             resumed_psnr.append(quality(folder))
-        equal = same(result, reference) if exact else resumed_psnr[-1] > min(psnr) - SPREAD
+        equal = result == reference if exact else resumed_psnr[-1] > min(psnr) - SPREAD
         held = {"one prune": one_prune, "the same result": equal, "nothing left lying": clean}
         for fact, true in {"killed": killed, f"at {place}": killed, **held}.items():
             tally[fact] += true
@@ -213,11 +200,7 @@ def kill_commands(kind: str, options: argparse.Namespace, bench: Bench, root: Pa
         output, older = outputs[name], dict.fromkeys(fresh[name], b"older")
         age: partial[None] = partial(write_all, output, older)
         age()
-        start: partial[BaseProcess] = partial(bench.start, command_here, words(name))
-        if place == ANY:
-            killed = bench.killed_at_any_time(start, age, seconds[name], rng)
-        else:
-            killed = bench.ended(start(place)) == -signal.SIGKILL
+        killed = bench.killed(partial(bench.start, command_here, words(name)), place, age, seconds[name], rng)
         left = contents(output)
         kept = all(left.get(path) in (older[path], fresh[name][path]) for path in older)
         bench.finish(command_here, words(name))

@@ -13,19 +13,19 @@ from __future__ import annotations
 
 import argparse
 import json
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from statistics import mean
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import torch
 from prune_without_photos import OTHER, decimated, device_of
 
 import sundae_ns as sn
 from harness.rows import Rows
+from sundae_ns.core.timing import now
 from sundae_ns.plugin.distill import LEVELS, levels_of
+from sundae_ns.rasterize.interface import fastest_device
 
 COLUMNS = ("field", "share", "tool", "gaussians", "psnr_to_field", "psnr_worst", "seconds", "device")
 OURS = "sundae"
@@ -56,19 +56,17 @@ def others(scene: sn.Scene, name: str, options: argparse.Namespace) -> Iterator[
 
 def trained(scene: sn.Scene, folder: Path) -> Iterator[tuple[sn.Scene, float]]:
     """Our levels, and the seconds that each took."""
-    began = time.monotonic()
+    began = now(scene.device)
     for level, _ in levels_of(scene):
-        if scene.device.type == "cuda":
-            torch.cuda.synchronize()
-        seconds = time.monotonic() - began
+        seconds = now(scene.device) - began
         sn.save(level, folder / "level.sog")
         yield sn.load(folder / "level.sog", device=scene.device), seconds
-        began = time.monotonic()
+        began = now(scene.device)
 
 
 def rows_of(path: Path, tool: str, options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """The rows of a field."""
-    scene = sn.load(path, device="cuda" if torch.cuda.is_available() else "cpu")
+    scene = sn.load(path, device=fastest_device())
     cameras = held_out(scene, options.decimated / f"{path.stem}.cameras.json")
     images = [sn.render(scene, camera).rgb for camera in cameras]
     with TemporaryDirectory() as folder:

@@ -13,7 +13,6 @@ import argparse
 import csv
 import sys
 import tempfile
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ import torch.distributed as dist
 
 from harness.job import configure, trainer_of
 from harness.plan import Job, parser_of
+from sundae_ns.core.timing import now
 from sundae_ns.io import checkpoint
 from sundae_ns.io.formats import read_gaussians
 
@@ -58,11 +58,9 @@ class Clock:
         self.started: float | None = None
 
     def now(self) -> float:
-        if torch.cuda.is_available():
-            torch.cuda.synchronize()
         if self.ranks > 1:
             dist.barrier()
-        return time.perf_counter()
+        return now("cuda" if torch.cuda.is_available() else "cpu")
 
     def __call__(self, step: int) -> Any:
         if self.started is None and step >= self.warm and step % self.ranks == 0:

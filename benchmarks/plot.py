@@ -27,8 +27,6 @@ STYLES = {
     "sundae-fast": ("D", "tab:blue"),
 }
 """Markers and colours of methods."""
-
-
 RULES = {"detail-merge": "default", "contribution-top": "contribution", "random": "random", "paper": "paper's band"}
 """Rules of the prune that are shown, and their names."""
 
@@ -38,12 +36,6 @@ def logarithmic(panel: Any, ticks: list[float]) -> None:
     panel.xaxis.set_major_formatter("{x:g}")
     panel.xaxis.set_minor_formatter(NullFormatter())
     panel.set_xticks(ticks)
-
-
-def legend(figure: Any) -> None:
-    """One legend for all panels."""
-    lines = {line.get_label(): line for panel in figure.axes for line in panel.get_legend_handles_labels()[0]}
-    figure.legend(lines.values(), lines, fontsize=9, loc="outside lower center", ncols=4)
 
 
 def plot_error() -> Any:
@@ -83,6 +75,8 @@ def plot_error() -> Any:
     graph.set(xlabel="seconds for millions of points", ylabel="relative error", yscale="log", ylim=(1e-8, 1e-6))
     graph.margins(x=0.1)
     logarithmic(graph, [0.01, 0.1, 1])
+    labels = {str(line.get_label()): line for panel in figure.axes for line in panel.get_legend_handles_labels()[0]}
+    figure.legend(labels.values(), labels, fontsize=9, loc="outside lower center", ncols=4)
     return figure
 
 
@@ -142,8 +136,6 @@ def main() -> None:
         figure = PLOTS[name]()
         for panel in figure.axes:
             panel.grid(alpha=0.3)
-        if figure.axes[0].get_legend() is None:
-            legend(figure)
         figure.savefig(FIGURES / f"{name}.png", dpi=110)
         print(f"wrote {name}.png")
 

@@ -20,7 +20,6 @@ import shlex
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,13 +30,13 @@ from torch import Tensor
 import sundae_ns as sn
 from harness.rows import Rows
 from sundae_ns.core.errors import SundaeError
+from sundae_ns.core.timing import now
 from sundae_ns.plugin.dataparsers import camera_of
 from sundae_ns.plugin.finished_runs import load_model
 
 COLUMNS = """capture tool rule training share primitives bytes bytes_sog psnr_to_field psnr ssim psnr_virtual seconds
 device seed steps""".split()
-PLACE = ("capture", "tool", "rule", "training", "share", "device", "seed", "steps")
-"""Columns that name a row."""
+NAMING = ("capture", "tool", "rule", "training", "share", "device", "seed", "steps")
 OURS, OTHER = "sundae_ns", "splat-transform"
 RULE = sn.PruneRule()
 TRAININGS = ("none", "distill", "distill-no-head")
@@ -76,26 +75,27 @@ def decimated(scene: sn.Scene, program: str, option: str, amount: str, folder: P
     source, out = folder / "full.ply", folder / "small.ply"
     if not source.exists():
         sn.save(scene, source)
-    began = time.monotonic()
+    began = now("cpu")
     words = [*shlex.split(program), "--gpu", "cpu", "--quiet", "-w", str(source), f"--{option}", amount, str(out)]
     subprocess.run(words, check=True, stdout=sys.stderr)
-    seconds = time.monotonic() - began
+    seconds = now("cpu") - began
     return sn.load(out, device=scene.device), seconds
 
 
-def jobs(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+def jobs(full: Full, options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """The rows to make, without their figures."""
     for share in options.shares:
+        about = {"capture": full.capture, "share": share, "device": device_of(full.scene), "seed": options.seed}
         for training in dict.fromkeys(["none", *options.training]):
             steps = 0 if training == "none" else options.steps
-            yield {"tool": OURS, "rule": RULE.selection, "training": training, "share": share, "steps": steps}
+            yield {**about, "tool": OURS, "rule": RULE.selection, "training": training, "steps": steps}
         for rule in ("decimate", "decimate-adaptive") if options.splat_transform else ():
-            yield {"tool": OTHER, "rule": rule, "training": "none", "share": share, "steps": 0}
+            yield {**about, "tool": OTHER, "rule": rule, "training": "none", "steps": 0}
 
 
 def made(full: Full, job: dict[str, Any], options: argparse.Namespace, folder: Path) -> tuple[sn.Scene, float]:
     """The small scene of a job, and the seconds that it took, without loading and saving."""
-    began, scene, share = time.monotonic(), full.scene, job["share"]
+    began, scene, share = now(full.scene.device), full.scene, job["share"]
     if job["tool"] == OTHER:
         small, seconds = decimated(scene, options.splat_transform, job["rule"], f"{100 * share:g}%", folder)
         return dataclasses.replace(scene, gaussians=small.gaussians), seconds
@@ -105,9 +105,7 @@ def made(full: Full, job: dict[str, Any], options: argparse.Namespace, folder: P
     else:
         head = job["training"] == "distill"
         small = sn.distill(scene, keep=share, steps=options.steps, seed=options.seed, head=head)
-    if scene.device.type == "cuda":
-        torch.cuda.synchronize()
-    return small, time.monotonic() - began
+    return small, now(scene.device) - began
 
 
 def row_of(full: Full, job: dict[str, Any], options: argparse.Namespace, folder: Path) -> dict[str, Any]:
@@ -121,7 +119,6 @@ def row_of(full: Full, job: dict[str, Any], options: argparse.Namespace, folder:
     photos = sn.measure(small, full.photos, full.cameras)
     return {
         **job,
-        "capture": full.capture,
         "primitives": small.num_gaussians,
         "bytes": sizes[".sundae"],
         "bytes_sog": sizes[".sog"],
@@ -130,8 +127,6 @@ def row_of(full: Full, job: dict[str, Any], options: argparse.Namespace, folder:
         "ssim": f"{photos.ssim:.4f}",
         "psnr_virtual": f"{sn.measure(small, full.scene, full.virtual).psnr:.3f}",
         "seconds": f"{seconds:.1f}",
-        "device": device_of(full.scene),
-        "seed": options.seed,
     }
 
 
@@ -146,7 +141,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--splat-transform", help="command of splat-transform, with options if it needs any")
     options = parser.parse_args()
-    rows, failed = Rows(options.out, COLUMNS, PLACE), 0
+    rows, failed = Rows(options.out, COLUMNS, NAMING), 0
     for run in options.runs:
         try:
             full = full_field(run, options.data)
@@ -154,15 +149,14 @@ def main() -> int:
             print(f"{run}: {error}", file=sys.stderr)
             failed = 1
             continue
-        known = {"capture": full.capture, "device": device_of(full.scene), "seed": options.seed}
         with tempfile.TemporaryDirectory() as folder:
-            for job in jobs(options):
-                if {**job, **known} in rows:
+            for job in jobs(full, options):
+                if job in rows:
                     continue
                 try:
                     rows.put(row_of(full, job, options, Path(folder)))
                 except (SundaeError, OSError, subprocess.CalledProcessError) as error:
-                    print(f"{full.capture}, {job}: {error}", file=sys.stderr)
+                    print(f"{job}: {error}", file=sys.stderr)
                     failed = 1
     return failed
 

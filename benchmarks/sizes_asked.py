@@ -25,7 +25,6 @@ from sundae_ns.report.measure import against_first, against_photos, measure
 from sundae_ns.scene.describe import held_out_cameras
 
 COLUMNS = ("capture", "source", "asked_mb", "got_mb", "psnr", "ssim")
-SIZES = (0.25, 0.5, 1.0, 2.0, 4.0)
 
 
 def made(path: Path, size: float, more: list[str], folder: Path) -> Path:
@@ -54,7 +53,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="+", type=Path, help="files of fields, and folders of captures")
     parser.add_argument("-o", "--out", type=Path, help="table of results; rows that are there are kept")
-    parser.add_argument("--sizes", nargs="+", type=float, default=list(SIZES), help="MB")
+    parser.add_argument("--sizes", nargs="+", type=float, default=[0.25, 0.5, 1.0, 2.0, 4.0], help="MB")
     parser.add_argument("--more", type=shlex.split, default=[], help="further options of prune or train")
     options = parser.parse_args()
     rows, failed = Rows(options.out, COLUMNS, ("capture", "source", "asked_mb")), 0

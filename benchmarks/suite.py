@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from harness.arms import choose_arms
-from harness.plan import Arm, Job, Words, jobs_of_shard, parser_of, plan_scene
+from harness.plan import Arm, Job, jobs_of_shard, parser_of, plan_scene
 from harness.results import Groups, Result, group, mean_of, percent, quality_page, spread
 from harness.rows import read_rows
 from harness.run import Options, Runner, check_out, compare, first_jobs, run_script
@@ -91,12 +91,17 @@ def run_suite(options: SuiteOptions, runner: Runner | None = None, console: Cons
 
 def plan_suite(options: SuiteOptions, arms: Sequence[Arm]) -> tuple[list[Job], dict[str, str]]:
     """Jobs on the captures of a folder, and the reasons for which captures are left out, by name."""
+    # Late, since they load the trainer.
+    from harness.job import parse
+    from sundae_ns.plugin.dataparsers import check_capture
+
     jobs: list[Job] = []
     left_out: dict[str, str] = {}
     for data, downscale in find_captures(options):
         try:
             parser = parser_of(data, downscale)
-            check(data, parser, options.method)
+            config: Any = parse((options.method, "--data", str(data), *parser)).pipeline.datamanager
+            check_capture(config.dataparser, data, ("train", "val"))  # as a training does
         except DataError as error:
             left_out[data.name] = str(error)
             continue
@@ -134,16 +139,6 @@ def find_scene(root: Path, scene: str) -> Path:
         paths = ", ".join(str(path) for path in found)
         raise DataError(f"{scene} is there more than once ({paths}); give a folder that holds it once")
     return found[0] if found else root / scene
-
-
-def check(data: Path, parser: Words, method: str) -> None:
-    """Check a capture as a training by a method of this package does; ``DataError`` if it cannot be used."""
-    # Late, since they load the trainer.
-    from harness.job import parse
-    from sundae_ns.plugin.dataparsers import check_capture
-
-    config: Any = parse((method, "--data", str(data), *parser)).pipeline.datamanager
-    check_capture(config.dataparser, data, ("train", "val"))
 
 
 def suite_page(results: Sequence[Result], arms: Sequence[Arm], left_out: Mapping[str, str], command: str) -> str:

@@ -17,7 +17,7 @@ key = f"{data.name}-warm-s{seed}"
 warm = ("--pipeline.model.pruning.mode", "off", "--pipeline.model.head.mode", "off", "--pipeline.model.stop-split-at", "12000",
         "--optimizers.means.scheduler.max-steps", "30000", "--schedule-length", "30000")  # fmt: skip
 if name == "warm":
-    perform(Job(key, "warm-up", data.name, "warm", str(data), "sundae", 12000, seed, options=warm, parser=parser), out)
+    perform(Job(key, "warm-up", data.name, "sundae-warm-up", str(data), "sundae", 12000, seed, options=warm, parser=parser), out)
     sys.exit()
 keep, *words = words
 steps = "18000"

@@ -6,14 +6,12 @@ import difflib
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
-import tyro
 import yaml
 
-from harness.plan import WARM_UP, Arm, Kind, Words
+from harness.plan import WARM_UP, Arm, Kind, Words, words_of
 from sundae_ns.core.errors import ConfigError
 from sundae_ns.io.pack.container import jsonschema  # without a grammar that takes it a second to compile
 
@@ -135,12 +133,13 @@ def _scaled(steps: int, scale: float) -> int:
 
 
 def _config_of(entry: Entry, method: str, methods: Mapping[str, Any]) -> Any:
+    from harness.job import parse
+
     if method not in methods:
         near = difflib.get_close_matches(method, methods) or ["sundae", "splatfacto"]
         raise ConfigError(f"arm {entry.name}: ns-train has no method {method!r}; use {' or '.join(near)}")
-    words = [word for name, value in entry.options.items() for word in (f"--{name}", *value)]
     try:
-        config = _parse(method, tuple(words))
+        config: Any = parse((method, *words_of(entry.options)))
         for part in ("pruning", "head"):
             validate = getattr(getattr(config.pipeline.model, part, None), "validate", None)
             if validate is not None:
@@ -150,12 +149,3 @@ def _config_of(entry: Entry, method: str, methods: Mapping[str, Any]) -> Any:
     except (ConfigError, ValueError) as error:
         raise ConfigError(f"arm {entry.name}: {error}") from error
     return config
-
-
-@cache  # a parse takes a third of a second
-def _parse(method: str, words: Words) -> Any:
-    """A configuration with options of the command line, as ``ns-train`` parses them; not to be changed."""
-    from nerfstudio.configs.method_configs import all_methods
-
-    default = all_methods[method]
-    return tyro.cli(tyro.conf.FlagConversionOff[type(default)], default=default, args=words)  # type: ignore[misc]

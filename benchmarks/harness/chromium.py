@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import base64
 import io
+import itertools
 import json
 import os
-import queue
 import shutil
 import signal
 import subprocess
@@ -17,9 +17,10 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, Self
 
 import msgspec
 import numpy as np
@@ -49,9 +50,6 @@ def find_chromium() -> str | None:
     return next((path for path in map(shutil.which, names) if path), None)
 
 
-Opened = TypeVar("Opened", bound="Browser")
-
-
 class BrowserError(RuntimeError):
     """The browser did not react in time, or refused a call."""
 
@@ -73,16 +71,15 @@ class Browser:
         self._command = [executable, *FLAGS, *flags, ONLY_LOOPBACK, size, "about:blank"]
         self._size = (width, height)
         self._stack = ExitStack()
-        self._answers: dict[int, queue.SimpleQueue[dict[str, Any]]] = {}
-        self._lock = threading.Lock()
-        self._calls = 0
+        self._answers: dict[int, Future[dict[str, Any]]] = {}
+        self._numbers = itertools.count(1)
         self.errors: list[str] = []
         """What the page wrote to its console as an error, and exceptions that it did not catch; without ``KNOWN``."""
         self.camera: Camera | None = None
         self.images: list[tuple[int, int]] = []
         """Width and height of every image that the viewer has sent."""
 
-    def __enter__(self: Opened) -> Opened:
+    def __enter__(self) -> Self:
         try:
             self._start()
         except BaseException:
@@ -143,40 +140,31 @@ class Browser:
         self, method: str, params: dict[str, Any] | None = None, *, browser: bool = False, timeout: float = 60
     ) -> dict[str, Any]:
         """Result of a call to the page or to the browser itself; ``BrowserError`` if it fails or takes too long."""
-        answer: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-        number = self._send(method, params, None if browser else self._page, answer)
         try:
-            message = answer.get(timeout=timeout)
-        except queue.Empty as error:
+            message = self._send(method, params, None if browser else self._page).result(timeout)
+        except TimeoutError as error:
             raise BrowserError(f"{method} took more than {timeout} s") from error
-        finally:
-            self._answers.pop(number, None)
         if "error" in message:
             raise BrowserError(f"{method}: {message['error'].get('message')}")
         return dict(message["result"])
 
-    def _send(self, method: str, params: dict[str, Any] | None, session: str | None, answer: Any = None) -> int:
-        with self._lock:
-            self._calls += 1
-            number = self._calls
-            if answer is not None:
-                self._answers[number] = answer
+    def _send(self, method: str, params: dict[str, Any] | None, session: str | None) -> Future[dict[str, Any]]:
+        number = next(self._numbers)
+        answer = self._answers[number] = Future()
         message = {"id": number, "method": method, "params": params or {}}
         self._socket.send(json.dumps(message if session is None else {**message, "sessionId": session}))
-        return number
+        return answer
 
     def _listen(self) -> None:
         with suppress(ConnectionClosed):
             for text in self._socket:
                 message = json.loads(text)
                 if "id" in message:
-                    answer = self._answers.get(message["id"])
-                    if answer is not None:
-                        answer.put(message)
+                    self._answers.pop(message["id"]).set_result(message)
                 else:
                     self._on_event(message["method"], message["params"])
-        for answer in list(self._answers.values()):
-            answer.put({"error": {"message": "the browser is gone"}})
+        while self._answers:
+            self._answers.popitem()[1].set_result({"error": {"message": "the browser is gone"}})
 
     def _on_event(self, method: str, params: dict[str, Any]) -> None:
         if method == "Target.attachedToTarget":
@@ -238,9 +226,7 @@ class Browser:
 
     def click(self, x: float, y: float) -> None:
         """Press and release the mouse at a pixel."""
-        self.mouse("mouseMoved", x, y)
-        self.mouse("mousePressed", x, y, pressed=True)
-        self.mouse("mouseReleased", x, y)
+        self.drag(x, y, x, y, steps=0)
 
     def drag(self, x: float, y: float, to_x: float, to_y: float, steps: int = 8, seconds: float = 0.0) -> None:
         """Press at one pixel and release at another, through ``steps`` in between."""

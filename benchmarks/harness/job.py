@@ -27,7 +27,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import profiler, writer
 
-from harness.plan import Job, Words, done_file, job_folder
+from harness.plan import WARM_UP, Job, Words, done_file, job_folder
 from harness.run import run_script
 from sundae_ns.core.errors import BackendError, CheckpointError, PackError, SundaeError
 from sundae_ns.core.files import write_text
@@ -103,15 +103,11 @@ def train_and_measure(job: Job, out: Path) -> dict[str, Any]:
         fine = packed and torch.cuda.is_available()
         tuned = tune(opened, job_folder(out, job.key) / "tuned.sundae") if fine else None
         had_gpu = alone()
-    measured = measured if had_gpu else without_times(measured)
+    if not had_gpu:
+        timeless = tuple(replace(configuration, ms=None) for configuration in measured.configurations)
+        measured = replace(measured, configurations=timeless, ms_head=None, train_s=None, prune_s=None)
     described = {"job": asdict(job), "measured": measured.as_json()}
     return {**described, "packed": packed, "tuned": tuned, "alone": had_gpu}
-
-
-def without_times(measured: Measured) -> Measured:
-    """The same measurements without seconds and milliseconds."""
-    timeless = tuple(replace(configuration, ms=None) for configuration in measured.configurations)
-    return replace(measured, configurations=timeless, ms_head=None, train_s=None, prune_s=None)
 
 
 def pack(opened: Opened, path: Path) -> dict[str, Any] | None:
@@ -189,7 +185,10 @@ def configure(job: Job, out: Path) -> tuple[TrainerConfig, str]:
     """The configuration as ``ns-train`` parses it, and that command; ``CheckpointError`` if its warm-up is not done."""
     start: Words = ()
     if job.kind == "branch":
-        start = ("--pipeline.model.warm-start", str(_run_folder(out, str(job.needs)) / "nerfstudio_models"))
+        if not done_file(out, str(job.needs)).exists():
+            raise CheckpointError(f"the warm-up {job.needs} is not done; run the whole plan")
+        run = job_folder(out, str(job.needs)) / f"{job.method}-{WARM_UP}" / job.method / "run"
+        start = ("--pipeline.model.warm-start", str(run / "nerfstudio_models"))
     fixed = ("--data", job.data, "--machine.seed", str(job.seed), "--max-num-iterations", str(job.steps))
     arguments = (job.method, *fixed, *job.options, *start, *job.parser)
     config = parse(arguments)
@@ -214,18 +213,6 @@ def _parsed(arguments: Words) -> TrainerConfig:
     if isinstance(config, SundaeTrainerConfig):
         set_schedule(config, all_methods.get(str(config.method_name)), arguments)
     return config
-
-
-def _run_folder(out: Path, key: str) -> Path:
-    path = done_file(out, key)
-    try:
-        done = json.loads(path.read_text(encoding="utf-8"))["job"]
-        # The folder in the result may be an old one: comparisons move.
-        return job_folder(out, key) / done["arm"] / done["method"] / "run"
-    except FileNotFoundError as error:
-        raise CheckpointError(f"the warm-up {key} is not done; run the whole plan") from error
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise CheckpointError(f"{path} cannot be read ({error}); remove it, and the job is done again") from error
 
 
 def _forget() -> None:

@@ -27,6 +27,7 @@ from sundae_ns.train import pruning, trials
 
 Place = Callable[[int], None]
 """Prepares this process to kill itself the n-th time that it comes there."""
+ANY = "any time"
 LONGEST = 900.0
 """Seconds after which a process counts as hanging; it takes about ten."""
 
@@ -105,25 +106,25 @@ COMMANDS = {
 }
 
 
-def train_here(config: TrainerConfig, log: Path, place: str | None = None, nth: int = 1) -> None:
+def train_here(config: TrainerConfig, log: Path, place: str = ANY, nth: int = 1) -> None:
     """Train in this process; die the ``nth`` time that ``place`` is reached."""
     _prepare(log, {**TRAINING, **TRIALS}, place, nth)
     train.main(config)
 
 
-def command_here(words: Sequence[str], log: Path, place: str | None = None) -> None:
+def command_here(words: Sequence[str], log: Path, place: str = ANY) -> None:
     """Run a command of sundae on a CPU in this process; die when ``place`` is reached."""
     os.environ["CUDA_VISIBLE_DEVICES"] = ""
     _prepare(log, COMMANDS, place, 1)
     sundae(words)
 
 
-def _prepare(log: Path, places: dict[str, Place], place: str | None, nth: int) -> None:
+def _prepare(log: Path, places: dict[str, Place], place: str, nth: int) -> None:
     torch.set_num_threads(1)
     with open(log, "a") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
-    if place is not None:
+    if place != ANY:
         places[place](nth)
 
 
@@ -138,9 +139,9 @@ class Bench:
             loaded = ["nerfstudio.scripts.train", "sundae_ns.plugin.model", "sundae_ns.plugin.trainer"]
             self.context.set_forkserver_preload(loaded)
 
-    def start(self, work: Any, what: Any, *arguments: Any) -> BaseProcess:
+    def start(self, work: Any, what: Any, **options: Any) -> BaseProcess:
         """Start a process that calls ``work`` with the log."""
-        child: BaseProcess = self.context.Process(target=work, args=(what, self.log, *arguments))
+        child: BaseProcess = self.context.Process(target=work, args=(what, self.log), kwargs=options)
         child.start()
         return child
 
@@ -164,11 +165,14 @@ class Bench:
     def fail(self, reason: str) -> None:
         raise SystemExit(f"{reason}; the end of its log:\n{self.log.read_text(errors='replace')[-3000:]}")
 
-    def killed_at_any_time(self, start: Any, again: Any, seconds: float, rng: random.Random) -> bool:
-        """Kill what ``start`` starts within ``seconds``; try ``again`` if it ended before. Whether it was killed.
+    def killed(self, start: Any, place: str, again: Any, seconds: float, rng: random.Random) -> bool:
+        """Whether what ``start`` starts was killed: at a place, or at any time within ``seconds``.
 
-        Of several processes a random one is killed; the others must end by themselves.
+        If it ended before, call ``again`` and repeat. Of several processes a random one is killed; the others must end
+        by themselves.
         """
+        if place != ANY:
+            return self.ended(start(place=place)) == -signal.SIGKILL
         for _ in range(10):
             child = start()
             time.sleep(rng.uniform(0.0, seconds))

@@ -10,6 +10,8 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import reduce
+from operator import getitem
 from typing import Any
 
 from sundae_ns.core.errors import SundaeError
@@ -57,12 +59,6 @@ def places(value: Json, path: tuple[Json, ...] = ()) -> Iterator[tuple[Json, ...
             yield from places(inner, (*path, key))
 
 
-def at(meta: Json, path: tuple[Json, ...]) -> Json:
-    for key in path:
-        meta = meta[key]
-    return meta
-
-
 def other_value(value: Json, rng: random.Random) -> Json:
     """A value in place of another: near it, of its kind, or of any kind."""
     kind = rng.randrange(6)
@@ -84,14 +80,14 @@ def change_value(pack: Pack, rng: random.Random) -> None:
     """Change one value; places in the list of sections are many, and less than half of the choices."""
     listed = rng.random() < 0.3
     *front, last = rng.choice([path for path in places(pack.meta) if (path[0] == "sections") == listed])
-    place = at(pack.meta, tuple(front))
+    place = reduce(getitem, front, pack.meta)
     place[last] = other_value(place[last], rng)
 
 
 def change_keys(pack: Pack, rng: random.Random) -> None:
     """Remove, rename or add an entry of an object."""
-    objects = [path for path in places(pack.meta) if isinstance(at(pack.meta, path), dict)]
-    place = at(pack.meta, rng.choice([(), *objects]))
+    objects = [path for path in places(pack.meta) if isinstance(reduce(getitem, path, pack.meta), dict)]
+    place = reduce(getitem, rng.choice([(), *objects]), pack.meta)
     keys = [key for key in place if key != "sections"]
     act = rng.randrange(3)
     if act == 0 and keys:

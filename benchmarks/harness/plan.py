@@ -118,7 +118,7 @@ def _warmup(base: Job, arm: Arm) -> Job:
         "schedule-length": (str(arm.total),),  # the first part of a whole run
     }
     key = f"{base.scene}-{name}-s{base.seed}"
-    words = _command(options)
+    words = words_of(options)
     return replace(base, key=key, kind="warm-up", arm=name, method=arm.method, steps=arm.warmup, options=words)
 
 
@@ -136,10 +136,11 @@ def _job(base: Job, arm: Arm, ratio: float | None) -> Job:
         }
     key = f"{base.scene}-{arm.name}-{'' if ratio is None else f'{100 * ratio:g}pct-'}s{base.seed}"
     made = replace(base, key=key, kind=arm.kind, arm=arm.name, method=arm.method, steps=arm.steps, keep_ratio=ratio)
-    return replace(made, options=_command({**options, **arm.options}))
+    return replace(made, options=words_of({**options, **arm.options}))
 
 
-def _command(options: Mapping[str, Words]) -> Words:
+def words_of(options: Mapping[str, Words]) -> Words:
+    """Options of ``ns-train`` by name as words of its command line."""
     return tuple(word for name, words in options.items() for word in (f"--{name}", *words))
 
 

@@ -115,7 +115,7 @@ def run_jobs(
 
     Returns the reason of each failure, by key; arguments and errors are those of :func:`compare`.
     """
-    done = _finished(out)
+    done = {result["job"]["key"]: result for result in read_results(out)}
     for job in jobs:
         if job.key in done:
             _check_same(job, done[job.key], out)
@@ -162,10 +162,6 @@ def spawn(job: Job, out: Path) -> None:
         if last.startswith(ERROR):  # an error of the package, complete in one line
             raise SundaeError(f"{last.removeprefix(ERROR)} (log: {log})")
         raise SundaeError(f"the job failed with {code}; {log} ends with:\n{end}")
-
-
-def _finished(out: Path) -> dict[str, Result]:
-    return {result["job"]["key"]: result for result in read_results(out)}
 
 
 def _check_same(job: Job, result: Result, out: Path) -> None:

@@ -352,10 +352,8 @@ def test_an_interrupt_leaves_nothing(tiny, tmp_path, monkeypatch):
 
 
 def test_full_memory_is_one_line(tiny, scene, monkeypatch):
-    def full(*_, **__):
-        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 300.00 MiB.")
-
-    monkeypatch.setattr(torch.autograd, "grad", full)
+    text = "CUDA out of memory. Tried to allocate 300.00 MiB."
+    monkeypatch.setattr(torch.autograd, "grad", Mock(side_effect=torch.cuda.OutOfMemoryError(text)))
     count = len(scene.gaussians["means"])
     with pytest.raises(MemoryExhaustedError, match=rf"cannot allocate 300\.00 MiB more with {count:,} Gaussians"):
         finetune(tiny.folder, scene, PackConfig(), 1)

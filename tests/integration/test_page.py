@@ -12,13 +12,13 @@ import os
 import threading
 from contextlib import contextmanager
 from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from http.server import ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from chromium import CHROMIUM, bench_page, browser, needs_chromium, needs_packages, touch
+from chromium import CHROMIUM, bench_page, bench_viewers, browser, needs_chromium, needs_packages, touch
 from packed_scenes import KINDS, packed_file, write_bomb, write_kind
 from PIL import Image
 
@@ -61,11 +61,6 @@ def opened(address, *, state="ready", flags=browser.WEBGPU, size=SIZE, before=""
         assert page.evaluate("sundae.state") == state, page.evaluate("sundae.message")
         yield page
         assert page.errors == []
-
-
-class Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, format, *args):  # noqa: A002
-        pass
 
 
 def rested(page):
@@ -123,7 +118,9 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def site(folder):
     """Address of the folder's site."""
-    with served(ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=folder / "site"))) as address:
+    with served(
+        ThreadingHTTPServer(("127.0.0.1", 0), partial(bench_viewers.Quiet, directory=folder / "site"))
+    ) as address:
         yield address
 
 

@@ -6,6 +6,7 @@ import re
 import signal
 import sys
 import tracemalloc
+from unittest.mock import Mock
 
 import kill_and_resume
 import numpy as np
@@ -209,20 +210,11 @@ def test_memory_does_not_grow_past_the_prune(tiny, resumed):
 
 
 def test_full_memory_in_the_backward_pass(tiny, resumed, monkeypatch):
-    def full(*_, **__):
-        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 300.00 MiB.")
-
-    trainer = resumed(tiny.checkpoints, 60, 5)
-    monkeypatch.setattr(Tensor, "backward", full)
+    trainer, text = resumed(tiny.checkpoints, 60, 5), "CUDA out of memory. Tried to allocate 300.00 MiB."
+    monkeypatch.setattr(Tensor, "backward", Mock(side_effect=torch.cuda.OutOfMemoryError(text)))
     count = trainer.pipeline.model.num_points
     with pytest.raises(MemoryExhaustedError, match=rf"cannot allocate 300\.00 MiB more with {count:,} Gaussians"):
         trainer.train()
-
-
-def stock_checkpoint(path, params):
-    """What nerfstudio saves, with the numpy number of its scheduler."""
-    pipeline = {f"_model.gauss_params.{name}": value for name, value in params.items()}
-    torch.save({"step": 29999, "pipeline": pipeline, "schedulers": {"means": {"_last_lr": [np.float64(1e-4)]}}}, path)
 
 
 @pytest.mark.parametrize(("source", "step"), [("nerfstudio_models", 119), ("a.ply", 119), ("step-000029999.ckpt", 30)])
@@ -232,7 +224,9 @@ def test_warm_start(tiny, trainer_of, tmp_path, source, step):
     if path.suffix == ".ply":
         write_ply(path, params, comments=[MODEL_FRAME])
     elif path.suffix == ".ckpt":
-        stock_checkpoint(path, params)
+        pipeline = {f"_model.gauss_params.{name}": value for name, value in params.items()}
+        schedulers = {"means": {"_last_lr": [np.float64(1e-4)]}}  # a number of numpy, as stock saves
+        torch.save({"step": 29999, "pipeline": pipeline, "schedulers": schedulers}, path)
     trainer = trainer_of(model={"warm_start": path if path.suffix else tiny.checkpoints}, max_num_iterations=3)
     model = trainer.pipeline.model
     for name in SPLAT_NAMES:

@@ -234,14 +234,6 @@ def judge_heads(monkeypatch):
     return fix
 
 
-def images_of(trainer, *models):
-    """Images of models from the first training camera, with their bases."""
-    camera = trainer.pipeline.datamanager.train_dataset.cameras[0:1]
-    with torch.no_grad():
-        outputs = [model.eval().get_outputs_for_camera(camera) for model in models]
-        return [(output["rgb"], output["base_rgb"]) for output in outputs]
-
-
 @pytest.mark.parametrize(
     ("chosen", "width", "head", "features", "tried"),
     [
@@ -294,13 +286,15 @@ def test_the_trials_start_alike_and_the_chosen_field_continues(make, judge_heads
     # No head leaves nothing behind.
     saved = torch.load(next(trainer.checkpoint_dir.glob("*.ckpt")), map_location="cpu", weights_only=True)
     opened = eval_setup(trainer.base_dir / "config.yml", test_mode="test")[1].model
-    (image, base), (again, _) = images_of(trainer, model, opened)
-    assert torch.equal(image, again)
+    camera = trainer.pipeline.datamanager.train_dataset.cameras[0:1]
+    with torch.no_grad():
+        shown, again = (each.eval().get_outputs_for_camera(camera) for each in (model, opened))
+    assert torch.equal(shown["rgb"], again["rgb"])
     scene = contents_of(load_run(trainer.base_dir))
     assert model.gauss_params["features"].shape[1] == width
     assert scene.gaussians.get("features", torch.zeros(1, 0)).shape[1] == width
     none = [
-        *(model.head is None, opened.head is None, not scene.head, torch.equal(image, base)),
+        *(model.head is None, opened.head is None, not scene.head, torch.equal(shown["rgb"], shown["base_rgb"])),
         not [name for name in saved["pipeline"] if "head" in name],
     ]
     assert none == [chosen == "plain"] * 5

@@ -69,13 +69,6 @@ def stray(data, times, edit, *, index=4):
     return Path(frames[index]["file_path"]).name
 
 
-def without(data, index, edit):
-    meta = meta_of(data)
-    name = meta["frames"].pop(index)["file_path"]
-    lists = {key: [file for file in meta[key] if file != name] for key in meta if key.endswith("_filenames")}
-    edit(data, frames=meta["frames"], **lists)
-
-
 def cameras_by_name(made):
     names = [path.name for path in made.train_dataset.image_filenames]
     return dict(zip(names, made.train_dataset.cameras.camera_to_worlds, strict=True))
@@ -108,7 +101,10 @@ def test_a_stray_camera_does_not_shrink_the_scene(capture, load, edit, capsys, t
     name = stray(capture, times, edit)
     made = load(capture)
     assert f"the camera of {name} is " in said(capsys)
-    without(capture, 4, edit)
+    meta = meta_of(capture)
+    gone = meta["frames"].pop(4)["file_path"]
+    lists = {key: [file for file in meta[key] if file != gone] for key in meta if key.endswith("_filenames")}
+    edit(capture, frames=meta["frames"], **lists)
     alone = load(capture)
     assert "times as far away" not in said(capsys)
     found, expected = cameras_by_name(made), cameras_by_name(alone)

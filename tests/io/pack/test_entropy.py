@@ -14,13 +14,6 @@ from sundae_ns.io.pack import entropy
 LARGEST = entropy.LARGEST
 
 
-def levels_of(n, width, seed):
-    rng = np.random.default_rng(seed)
-    found = np.rint(rng.laplace(size=(n, width)) * 10 ** rng.uniform(-1, 6, width)).astype(np.int32)
-    found[rng.random((n, width)) < 0.02] = rng.choice([-LARGEST, LARGEST])
-    return found.clip(-LARGEST, LARGEST)
-
-
 def cells_of(n, bits, block, seed):
     codes = interleave(np.random.default_rng(seed).integers(0, 2**bits, (n, 3)).astype(np.uint64))
     for start in range(0, n, block):
@@ -30,7 +23,10 @@ def cells_of(n, bits, block, seed):
 
 @given(st.integers(0, 300), st.integers(1, 6), st.integers(0, 2**16))
 def test_numbers_come_back(n, width, seed):
-    levels = levels_of(n, width, seed)
+    rng = np.random.default_rng(seed)
+    levels = np.rint(rng.laplace(size=(n, width)) * 10 ** rng.uniform(-1, 6, width)).astype(np.int32)
+    levels[rng.random((n, width)) < 0.02] = rng.choice([-LARGEST, LARGEST])
+    levels = levels.clip(-LARGEST, LARGEST)
     near = entropy.neighbours_of(np.random.default_rng(seed).integers(0, 99, (n, 3)), 1 + seed % 50)
     assert np.array_equal(entropy.decode_levels(entropy.encode_levels(levels, near), width, near), levels)
 
