@@ -1,4 +1,4 @@
-"""The job of a capture that lab/few_views.py may have cut, by words of ns-train."""
+"""The job of a capture that benchmarks/few_views.py may have cut, by words of ns-train."""
 
 import sys
 from pathlib import Path

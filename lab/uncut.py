@@ -1,4 +1,4 @@
-"""Captures cut by lab/few_views.py, whose images stay where they are: uncut.py pack CUT CAPTURE OUT, or uncut.py unpack FOLDER SCENES."""
+"""Captures cut by benchmarks/few_views.py, whose images stay where they are: uncut.py pack CUT CAPTURE OUT, or uncut.py unpack FOLDER SCENES."""
 
 import shutil
 import sys
