@@ -347,12 +347,12 @@ def read_ply(path: Path) -> dict[str, Tensor]:
         raise DataError(f"{path} has {rest} f_rest properties, which fit no SH degree; export it again.")
     params = {name: _columns(rows, names) for name, names in columns.items() if name != "means"}
     params["means"] = _columns(rows, columns["means"], np.result_type(np.float32, *(rows[x].dtype for x in "xyz")))
-    alphas, scales = params["opacities"], params["scales"]
-    wide = (scales > 0).all()
+    alphas, scales = params["opacities"].nan_to_num(nan=0.5), params["scales"]
+    wide = len(rows) > 99 and not (scales < 0).any() and bool((scales > 0).any())  # some may be NaN, or 0
     # No real scene has such logarithms and logits throughout: their logarithms reach as far below the median as above.
-    shares = ((alphas - 0.5).abs() <= 0.5).all() and (wide or alphas.max() - alphas.min() > 0.5)
-    low, middle, high = np.percentile(scales, (1, 50, 99)) if wide and len(rows) > 99 else (0, 1, 1)
-    if len(rows) > 99 and (shares or middle < 0.1 or high - middle > 5 * (middle - low)):
+    shares = len(rows) > 99 and ((alphas - 0.5).abs() <= 0.5).all() and (wide or alphas.max() - alphas.min() > 0.5)
+    low, middle, high = np.nanpercentile(scales, (1, 50, 99)) if wide else (0, 1, 1)
+    if shares or middle < 0.1 or high - middle > 5 * (middle - low):
         raise DataError(f"{path} has widths and opacities, not their logarithms and logits; export it again.")
     if is_flat:
         params["scales"] = torch.nn.functional.pad(params["scales"], (0, 1), value=-math.inf)
