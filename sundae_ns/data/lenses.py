@@ -118,8 +118,9 @@ def with_focal_lengths(meta: dict[str, Any], folder: Path) -> dict[str, Any]:
     if not known[0] or any(isinstance(entry, dict) and "fl_x" in entry for entry in entries):
         return meta
     size: Any = (None, None)
-    with suppress(Exception), Image.open(folder / meta["frames"][0]["file_path"]) as image:
-        size = image.size
+    for suffix in ("", ".png"):  # Blender leaves it out
+        with suppress(Exception), Image.open(f"{folder / meta['frames'][0]['file_path']}{suffix}") as image:
+            size = image.size
     width, height = meta.get("w", size[0]), meta.get("h", size[1])
     if not isinstance(width, (int, float)) or not isinstance(height, (int, float)):
         return meta

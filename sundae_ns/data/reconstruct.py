@@ -30,8 +30,7 @@ from sundae_ns.io.run_folder import reserve
 Matching = Literal["auto", "exhaustive", "sequential", "similar"]
 Reporter = Callable[[str, int], AbstractContextManager[Advance]]  # a stage by its name and its number of parts
 INSTALL = 'pip install "sundae_ns[photos]"'
-_MOST_EXHAUSTIVE = 200  # photos up to which all pairs are compared: 19,900 pairs
-_ALIKE = 40  # similar photos that each is compared with
+_MOST_EXHAUSTIVE, _ALIKE = 200, 40  # photos up to which all pairs are compared, and similar ones for each beyond that
 _PAIRS_AT_ONCE = 100  # per thread between two reports of progress
 
 

@@ -14,9 +14,10 @@ from small_captures import write_text_model
 from sundae_ns.core.errors import DataError
 from sundae_ns.core.files import write_text
 from sundae_ns.data import layouts
-from sundae_ns.data.capture import beside
+from sundae_ns.data.capture import beside, read_json
 from sundae_ns.data.colmap import check_colmap
 from sundae_ns.data.layouts import is_posed, no_model, no_transforms, posed_layout, unused_masks
+from sundae_ns.data.lenses import with_focal_lengths
 
 
 def model(folder, images=3):
@@ -66,6 +67,7 @@ def blender(data, **changes):
 def test_a_capture_of_blender(tmp_path):
     data = blender(tmp_path / "lego")
     assert is_posed(data)
+    assert with_focal_lengths(read_json(data / "transforms_train.json"), data)["w"] == 20
     layout = posed_layout(data)
     assert layout.description == "Blender layout: 2 training images, over white"
     assert (layout.words, layout.options[-1]) == (["blender-data"], "white")
