@@ -42,9 +42,9 @@ def _model_folders(data: Path) -> list[Path]:
     usual = [data / name for name in _MODELS]
     numbered = [path for folder in usual for path in entries(folder) if path.name.isdigit()]
     numbered += [path / "sparse" for path in numbered]  # dense/0/sparse, of COLMAP's automatic reconstruction
-    # RealityScan puts a model beside the images or their folder; one without them is no capture.
+    # RealityScan puts a model beside the images or their folder, others any name; one without images is no capture.
     has_images = any(path.name in _IMAGES or path.suffix.lower() in _SUFFIXES for path in entries(data))
-    return [folder for folder in (*usual, *numbered, *([data] if has_images else [])) if is_model(folder)]
+    return [*filter(is_model, dict.fromkeys([*usual, *numbered, *([data, *entries(data)] if has_images else [])]))]
 
 
 def models_in(data: Path) -> dict[str, int]:
@@ -120,10 +120,10 @@ def no_transforms(data: Path) -> DataError:
         advice += f"; it is in Blender's layout ({_BLENDER}): add `blender-data` to ns-train"
     elif models := models_in(data):
         advice += f"; it is in COLMAP layout: add {_words(data, models)} to ns-train"
-    elif is_model(data):
+    elif is_model(data) or any(map(is_model, entries(data))):
         advice = f"{data} is a COLMAP model without its images; give the folder that holds both"
-    elif inner := next((path for path in entries(data) if (path / "transforms.json").is_file()), None):
-        advice += f", but {inner} has; give that folder"
+    elif inner := next((path for path in entries(data) if path.is_dir() and is_posed(path)), None):
+        advice = f"{data} is no capture, but {inner} is; give that folder"
     else:
         path = shlex.quote(f"./{data}" if str(data).startswith("-") else str(data))
         advice += f"{beside(data / 'transforms.json')}; make a capture of images with `sundae poses {path} -o CAPTURE`"

@@ -12,7 +12,6 @@ from photos import photo, photos
 from small_captures import write_text_model
 
 from sundae_ns.core.errors import DataError
-from sundae_ns.core.files import write_text
 from sundae_ns.data import layouts
 from sundae_ns.data.capture import beside, read_json
 from sundae_ns.data.colmap import check_colmap
@@ -25,7 +24,7 @@ def model(folder, images=3):
 
 
 PLACES = """sparse/0 images|colmap/sparse/0 images|sparse images|dense/sparse dense/images|dense dense/images|\
-dense/0/sparse dense/0/images|distorted/sparse/0 input|undistorted/sparse Images|sparse/0 .|. images|. ."""
+dense/0/sparse dense/0/images|distorted/sparse/0 input|undistorted/sparse Images|text images|sparse/0 .|. images|. ."""
 """Folders of a model and of its images: by COLMAP, its automatic reconstruction, 3DGS, RealityScan."""
 
 
@@ -105,9 +104,9 @@ ADVICE = {
     "several models": (_several, "add `colmap --colmap-path sparse/1` (the largest of 3 models, with 20 images)"),
     "a model in sparse": (lambda data: model(data / "sparse"), "add `colmap --colmap-path sparse` to ns-train"),
     "a text": (_text, "add `colmap --colmap-path colmap/sparse/0` to ns-train"),
-    "a model alone": (model, "is a COLMAP model without its images"),
+    "a model alone": (lambda data: model(data / "0"), "is a COLMAP model without its images"),
     "Blender": (blender, "it is in Blender's layout (transforms_train.json): add `blender-data` to ns-train"),
-    "a folder further in": (lambda data: write_text(data / "room/transforms.json", "{}"), "room has; give that folder"),
+    "a folder further in": (lambda data: model(data / "room/sparse"), "room is; give that folder"),
     "another name": (lambda data: (data / "Transforms.json").touch(), "(there is Transforms.json); make a capture of"),
     "nothing": (lambda _: None, "make a capture of images with `sundae poses "),
 }
