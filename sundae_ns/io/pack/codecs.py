@@ -388,14 +388,23 @@ def fit_codecs(
     values = {name: as_matrix(gaussians[name]) for name in (*SPLAT_NAMES, FEATURES) if name in gaussians}
     order, near = scene_order(values["means"])
     filled = min(range(config.block, max(config.block // 2, 15), -1), key=lambda size: max(near % size, 16))
-    widths = np.exp(values["scales"].max(axis=1).clip(max=80))
+    widths = np.exp(values["scales"][order].max(axis=1).clip(max=80))
     finer = range(config.position_bits, min(config.position_bits + 4, 16) + 1)
     smaller = (max(config.block >> by, 16) for by in (2, 4, 6))
     # What lies far away makes a block coarse: another bit for each coordinate costs less than smaller blocks.
-    for block, bits in ((config.block, config.position_bits), *itertools.product((filled, *smaller), finer)):
+    layouts = ((config.block, config.position_bits), *itertools.product((filled, *smaller), finer))
+
+    def placed(block: int, bits: int) -> tuple[float, Blocks, NDArray[np.int64]]:
+        """The share of near Gaussians whose cells are wide beside them, the positions in blocks, and their order."""
         blocks, within = quantize_positions(values["means"][order], bits, block)
-        grid = ((blocks.high.astype(np.float64) - blocks.low) / 2**bits).max(axis=1)
-        if (grid[np.arange(len(order)) // block] > 3 * widths[order[within]])[:near].mean() < 1e-3:
+        cells = ((blocks.high.astype(np.float64) - blocks.low) / 2**bits).max(axis=1)[np.arange(len(order)) // block]
+        return (cells > 3 * widths[within])[:near].mean(), blocks, within
+
+    # Training shrinks what shows nothing: no cells are fine enough for it, and it must not ask for the finest.
+    most = placed(*layouts[-1])[0] + 1e-3
+    for block, bits in layouts:
+        share, blocks, within = placed(block, bits)
+        if share <= most:
             break
     config = replace(config, block=block, position_bits=bits)
     values = {name: value[order[within]] for name, value in values.items()}
