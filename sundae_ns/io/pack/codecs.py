@@ -226,8 +226,7 @@ def fit_transform(rows: Floats, step: float, *, centred: bool = True, form: Tens
 
 def _roots(size: int, form: Tensor | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The symmetric root ``[D, D]`` of a form, scaled to a mean eigenvalue of 1, and its inverse."""
-    mean = 0.0 if form is None else form.trace().item() / size
-    if form is None or mean <= 0:  # a head whose last layer is still zero sees no feature
+    if form is None or (mean := form.trace().item() / size) <= 0:  # a new head's last layer of zeros sees no feature
         return np.eye(size), np.eye(size)
     values, vectors = np.linalg.eigh(form.numpy() / mean)
     roots = np.sqrt(np.maximum(values, _LEAST_EIGENVALUE))
@@ -294,19 +293,18 @@ class HeadCodec:
 
     def encode(self, head: Mapping[str, Tensor]) -> Coded:
         """The stored form, with the levels of all weights in one column; ``PackError`` if some are not finite."""
-        names = sorted(head)
-        values = {name: _on_cpu(head[name]) for name in names}
+        values = {name: _on_cpu(head[name]) for name in sorted(head)}
         if not all(torch.isfinite(value).all() for value in values.values()):
             raise PackError("the head has weights that are not finite; go back to an earlier checkpoint")
-        weights = [name for name in names if values[name].ndim > 1]
-        plain = [values[name].flatten() for name in names if name not in weights]
+        weights = [name for name, value in values.items() if value.ndim > 1]
+        plain = [value.flatten() for value in values.values() if value.ndim <= 1]
         levels = [weight_levels(values[name], self.steps(name)).flatten() for name in weights]
 
         def joined(parts: list[Tensor]) -> Array:
             return torch.cat([*parts, torch.zeros(0)]).numpy()
 
         column = joined(levels)[:, None].astype(np.int32)
-        shapes = [[name, list(values[name].shape)] for name in names]
+        shapes = [[name, list(value.shape)] for name, value in values.items()]
         about = {"codec": "channels", "weights": len(column), "tensors": shapes}
         steps, columns = ([side[name] for name in weights] for side in (self.rows, self.columns))
         return about, column, {"plain": joined(plain), "steps": joined(steps), "columns": joined(columns)}
@@ -388,23 +386,18 @@ def fit_codecs(
     values = {name: as_matrix(gaussians[name]) for name in (*SPLAT_NAMES, FEATURES) if name in gaussians}
     order, near = scene_order(values["means"])
     filled = min(range(config.block, max(config.block // 2, 15), -1), key=lambda size: max(near % size, 16))
-    widths = np.exp(values["scales"][order].max(axis=1).clip(max=80))
+    widths = np.exp(values["scales"].max(axis=1).clip(max=80))
     finer = range(config.position_bits, min(config.position_bits + 4, 16) + 1)
     smaller = (max(config.block >> by, 16) for by in (2, 4, 6))
     # What lies far away makes a block coarse: another bit for each coordinate costs less than smaller blocks.
-    layouts = ((config.block, config.position_bits), *itertools.product((filled, *smaller), finer))
-
-    def placed(block: int, bits: int) -> tuple[float, Blocks, NDArray[np.int64]]:
-        """The share of near Gaussians whose cells are wide beside them, the positions in blocks, and their order."""
+    layouts = [(config.block, config.position_bits), *itertools.product((filled, *smaller), finer)]
+    coarse: list[float] = []
+    # The finest first: no cells suit what training has shrunk to nothing, and it must not ask for these.
+    for block, bits in (layouts[-1], *layouts):
         blocks, within = quantize_positions(values["means"][order], bits, block)
-        cells = ((blocks.high.astype(np.float64) - blocks.low) / 2**bits).max(axis=1)[np.arange(len(order)) // block]
-        return (cells > 3 * widths[within])[:near].mean(), blocks, within
-
-    # Training shrinks what shows nothing: no cells are fine enough for it, and it must not ask for the finest.
-    most = placed(*layouts[-1])[0] + 1e-3
-    for block, bits in layouts:
-        share, blocks, within = placed(block, bits)
-        if share <= most:
+        grid = ((blocks.high.astype(np.float64) - blocks.low) / 2**bits).max(axis=1)
+        coarse.append((grid[np.arange(len(order)) // block] > 3 * widths[order[within]])[:near].mean())
+        if len(coarse) > 1 and coarse[-1] <= coarse[0] + 1e-3:
             break
     config = replace(config, block=block, position_bits=bits)
     values = {name: value[order[within]] for name, value in values.items()}
@@ -414,8 +407,7 @@ def fit_codecs(
     codecs: dict[str, Rotations | Transform] = {"quats": Rotations(config.rotation_step)}
     for name, option in _STEPS.items():
         if name != "quats" and name in values and values[name].size:
-            form = sensitivity.rows.get(name)
-            step = getattr(config, option)
+            form, step = sensitivity.rows.get(name), getattr(config, option)
             codecs[name] = fit_transform(values[name], step, centred=name != "features_rest", form=form)
     ordered = {name: torch.from_numpy(values[name]).reshape(gaussians[name].shape) for name in values}
     return ordered, Codecs(config, blocks, codecs, _fit_head(head, config.head_step, sensitivity.head))
@@ -483,11 +475,10 @@ def _of_rows(levels: Tensor) -> Tensor:
     in_runs = n // _RUN * _RUN
     runs = [levels[:in_runs].reshape(-1, _RUN, width), levels[in_runs:].reshape(-1, max(n - in_runs, 1), width)]
     total = levels.new_zeros(())
-    for run in runs:
-        if run.numel():
-            means = run.mean(dim=1, keepdim=True)
-            deviations = (run - means).abs().mean(dim=1)
-            total = total + _of_magnitudes(deviations, run.shape[1]) + _of_magnitudes(means.abs(), 1)
+    for run in filter(torch.numel, runs):
+        means = run.mean(dim=1, keepdim=True)
+        deviations = (run - means).abs().mean(dim=1)
+        total = total + _of_magnitudes(deviations, run.shape[1]) + _of_magnitudes(means.abs(), 1)
     return total
 
 
