@@ -182,7 +182,7 @@ class Scene:
 
     @property
     def offset(self) -> Direction | None:
-        """Offset that opening a file subtracts from survey coordinates, and that writing one adds; None without one."""
+        """Offset of survey coordinates: reading a file subtracts it, writing one adds it; None for none."""
         frame = {} if self.in_model_frame else self.meta.get("frame", {})
         rows = np.array(frame.get("transform", np.zeros((3, 4))), np.float64)[:3]
         if frame.get("scale") != 1 or not np.array_equal(rows[:, :3], np.eye(3)):
