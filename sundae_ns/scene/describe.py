@@ -30,7 +30,6 @@ from sundae_ns.scene.virtual_cameras import by_device, virtual_cameras
 
 HELD_OUT = 16  # cameras that measure the loss of a change
 PIXELS = {"cpu": 1 << 18, "cuda": 1 << 20}  # most of their images, by the device
-LOOKING = 64  # virtual cameras that measure visibility in a scene without cameras
 _PRODUCER = re.compile(rb'(?im)"generator"\s*:\s*"([^"]{1,200})"|^comment ([^\r\n]* (?:by|from) [^\r\n]{1,200})')
 
 
@@ -66,7 +65,7 @@ def describe(
     ``crop`` a box, lowest corner first, of 99% of what they see. Cameras are by default the stored, else virtual ones.
     """
     cameras = cameras or scene.cameras
-    views = for_cleaning(cameras) or virtual_cameras(scene, LOOKING)
+    views = for_cleaning(cameras) or virtual_cameras(scene, 64)
     weights = weights_in(scene, views, console=console)
     means = means_in_file(scene)
     with path.open("rb") if path.is_file() else BytesIO() as file:

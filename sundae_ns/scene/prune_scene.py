@@ -39,7 +39,6 @@ REFIT_PIXELS, MOST_PIXELS = 1 << 18, 1 << 22  # most pixels of an image of a ref
 SAMPLED = 64, 8192  # random Gaussians of two files, whose difference gives the bytes of each
 LEAST, AIM = 0.97, 0.985  # shares of the size: the least that is accepted, and the aim of each file
 JUDGES, PIXELS = 8, 1 << 16  # cameras that compare fits and forms, and most pixels of their images for forms
-MOST_FILES = 8  # of the last search
 T = TypeVar("T")
 
 
@@ -404,7 +403,7 @@ def largest(
     """
     low, high = powers
     best, before = None, None
-    for _ in range(MOST_FILES):
+    for _ in range(8):
         made = at(power)
         if (size := bytes_of(made)) <= most:
             high, best = power, made

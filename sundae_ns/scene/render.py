@@ -39,6 +39,7 @@ class RenderSettings:
     absgrad: bool = False  # Whether to sum absolute gradients of the projected centres
     head: CompensationHead | None = None  # The head; None while it is disabled
     trained_focal: tuple[float, float] | None = None  # Shortest and longest focal length of the head's images, pixels
+    near_plane: float = NEAR_PLANE  # Gaussians with a smaller camera z are not drawn, world units
 
 
 def colors_from(params: Mapping[str, Tensor], gaussians: Gaussians, center: Tensor, settings: RenderSettings) -> Tensor:
@@ -82,7 +83,7 @@ def pass_inputs(
     if settings.drop_rate > 0:  # The others make up for them (Park et al., "DropGaussian", 2025)
         opacities = torch.nn.functional.dropout(opacities, settings.drop_rate).clamp(max=1)
     splats = (params["means"], params["quats"], params["scales"].exp(), opacities, colors)
-    return Inputs(*splats, camera, near_plane=NEAR_PLANE, antialiased=settings.antialiased, **extra)
+    return Inputs(*splats, camera, near_plane=settings.near_plane, antialiased=settings.antialiased, **extra)
 
 
 def splat(

@@ -25,7 +25,7 @@ from sundae_ns.graph.neighbors import knn
 from sundae_ns.head.head import CompensationHead
 from sundae_ns.io.coordinates import Direction
 from sundae_ns.rasterize.interface import BackendName, select_backend
-from sundae_ns.scene.render import SHOWN_BACKGROUNDS, GaussianSource, RenderSettings, render_view
+from sundae_ns.scene.render import NEAR_PLANE, SHOWN_BACKGROUNDS, GaussianSource, RenderSettings, render_view
 
 Background = Literal["random", "black", "white"]  # a scene trained over random ones is shown on nerfstudio's grey
 
@@ -243,21 +243,16 @@ def from_points(points: Tensor, rgb: Tensor, *, sh_degree: int) -> dict[str, Ten
         width = knn(points, min(3, n - 1)).distances.mean(dim=1).to(points)
         positive = width[width > 0]
         width = width.clamp_min(float(positive.min()) if len(positive) else 1e-3)
+    u, v, w = torch.rand(3, n) * torch.tensor([[1.0], [2 * torch.pi], [2 * torch.pi]])
+    a, b = (1 - u).sqrt(), u.sqrt()  # of uniform unit quaternions (Shoemake, 1992)
     return {
         "means": points.clone(),
         "scales": width.log()[:, None].repeat(1, 3),
-        "quats": random_quaternions(n).to(points.device),
+        "quats": torch.stack([a * v.sin(), a * v.cos(), b * w.sin(), b * w.cos()], dim=-1).to(points.device),
         "features_dc": rgb_to_sh(rgb),
         "features_rest": points.new_zeros(n, (sh_degree + 1) ** 2 - 1, 3),
         "opacities": points.new_full((n, 1), 0.1).logit(),
     }
-
-
-def random_quaternions(n: int) -> Tensor:
-    """Uniformly distributed unit quaternions ``[n, 4]`` (Shoemake, 1992)."""
-    u, v, w = torch.rand(3, n) * torch.tensor([[1.0], [2 * torch.pi], [2 * torch.pi]])
-    a, b = (1 - u).sqrt(), u.sqrt()
-    return torch.stack([a * v.sin(), a * v.cos(), b * w.sin(), b * w.cos()], dim=-1)
 
 
 def initial_features(features_dc: Tensor, num_features: int, generator: torch.Generator | None = None) -> Tensor:
@@ -347,6 +342,10 @@ def render(scene: Scene, camera: Camera, *, head: bool = True, backend: BackendN
     """
     (camera,) = usable_cameras((camera,))
     settings = scene.settings(backend, head=head)
+    if not scene.in_model_frame:  # a scene of millimetres would lie behind the usual near plane
+        some = scene.means.detach()[:: -(-len(scene) // 1024)]
+        size = float((some - some.median(dim=0).values).norm(dim=1).median())
+        settings = replace(settings, near_plane=min(NEAR_PLANE, size / 10) or NEAR_PLANE)
     wanted = any(value.requires_grad for value in (*scene.gaussians.values(), camera.viewmat, camera.K))
     wanted |= settings.head is not None and settings.head.training
     with naming_full_memory(lambda: scene.num_gaussians), torch.set_grad_enabled(wanted and torch.is_grad_enabled()):

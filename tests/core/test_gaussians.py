@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 
 from sundae_ns.core.errors import DataError
 from sundae_ns.core.gaussians import SPLAT_NAMES, Gaussians, odd_shapes, sanitise, sh_degree_of, sh_to_rgb
-from sundae_ns.scene.scene import from_points, initial_features, random_quaternions
+from sundae_ns.scene.scene import from_points, initial_features
 
 N = 40
 gaussians = partial(normal_field, N, features=3)
@@ -91,7 +91,7 @@ def test_features_begin_with_the_colour_and_differ(width):
 
 def test_rotations_are_uniform():
     torch.manual_seed(0)
-    quats = random_quaternions(20000)
+    quats = from_points(*torch.rand(2, 20000, 3), sh_degree=0)["quats"]
     torch.testing.assert_close(quats.T @ quats / 20000, torch.eye(4) / 4, atol=0.01, rtol=0)
 
 

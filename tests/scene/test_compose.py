@@ -77,6 +77,8 @@ def test_moved_cameras_see_the_same_image(tmp_path):
                 expected = SCALE * TURN @ camera.center.double() + SHIFT
                 torch.testing.assert_close(there.center.double(), expected, atol=1e-4, rtol=0)
         assert after.up == (whole.up and pytest.approx((TURN @ torch.tensor(whole.up).double()).tolist()))
+    tiny = sn.transform(whole, scale=1e-4)
+    torch.testing.assert_close(sn.render(tiny, tiny.cameras[0]).rgb, sn.render(whole, whole.cameras[0]).rgb)
     same = sn.transform(scene(), QUATERNION * 3, SCALE, SHIFT.tolist())
     torch.testing.assert_close(same.gaussians["features_rest"], moved(scene()).gaussians["features_rest"])
 
