@@ -45,7 +45,7 @@ def cameras_of(path: Path | str, scene: Scene | None = None) -> list[Camera]:
         scene: whose coordinates the cameras get; needed for a run's scene, as training moves and scales its capture.
 
     Raises:
-        DataError: the file is missing, damaged, or holds no cameras.
+        DataError: the file is missing, damaged, or holds no cameras; or the scene does not place those of its capture.
 
     >>> import json, pathlib, tempfile, sundae_ns as sn
     >>> frame = {"transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]}
@@ -114,13 +114,13 @@ def _of_path(entry: Any, content: dict[str, Any], where: str) -> Pinhole:
 
 def _to_model(scene: Scene | None, content: dict[str, Any], where: str) -> tuple[np.ndarray, float]:
     """Transform ``[4, 4]`` and then scale, from the coordinates of a ``transforms.json`` to those of a scene."""
-    frame = scene.meta.get("frame") if scene is not None else None
-    if frame is None or "camera_path" in content:  # of the viewer, which shows the model
-        return np.eye(4), 1.0
+    if scene is None or "camera_path" in content or not (scene.in_model_frame or "frame" in scene.meta):
+        return np.eye(4), 1.0  # a path is one of the viewer, which shows the model
+    if (frame := scene.meta.get("frame")) is None:  # as of a .ply by ns-export
+        raise DataError(f"{where}: the scene does not state where cameras of its capture are; give its run, or a path")
     transform, applied = np.eye(4), np.eye(4)  # a run states its transform for the capture before the applied one
     transform[:3] = np.asarray(frame["transform"], np.float64)[:3]
-    if "applied_transform" in content:
-        applied[:3] = matrix(content["applied_transform"], (3,), "applied_transform", where)
+    applied[:3] = matrix(content.get("applied_transform", np.eye(3, 4)), (3,), "applied_transform", where)
     scale = float(frame["scale"]) / finite(content.get("applied_scale", 1.0), "applied_scale", where, positive=True)
     return transform @ np.linalg.inv(applied), scale
 

@@ -25,7 +25,6 @@ def model(folder, images=3):
 
 PLACES = """sparse/0 images|colmap/sparse/0 images|sparse images|dense/sparse dense/images|dense dense/images|\
 dense/0/sparse dense/0/images|distorted/sparse/0 input|undistorted/sparse Images|text images|sparse/0 .|. images|. ."""
-"""Folders of a model and of its images: by COLMAP, its automatic reconstruction, 3DGS, RealityScan."""
 
 
 @pytest.mark.parametrize("places", PLACES.split("|"))
