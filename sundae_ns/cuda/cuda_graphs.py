@@ -14,7 +14,6 @@ import torch
 from sundae_ns.core.errors import BackendError
 
 MAX_GRAPHS = 4  # Graphs cached at a time: each holds its own images and activations
-
 RECORD_AT = 3  # Requests in a row after which a key is recorded: a viewer that is being resized never repeats a size
 
 _Result = TypeVar("_Result")

@@ -50,8 +50,13 @@ def knn(points: Tensor, k: int) -> Neighbors:
     """
     if k < 1:
         raise ConfigError(f"cannot search for {k} neighbours: use at least 1")
-    _check(points)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise DataError(f"positions have shape {list(points.shape)}: pass [N, 3]")
     n = len(points)
+    if bad := int((~torch.isfinite(points)).any(dim=1).sum()):
+        raise DataError(f"{bad} of {n} positions are NaN or infinite: drop them before building a graph")
+    if points.dtype == torch.float64 and n and float(points.detach().abs().max()) > MOST_EXTENT:
+        raise DataError(f"positions exceed {MOST_EXTENT:g}: their squared distances overflow, scale the scene")
     if n <= k:
         raise DataError(
             f"{n} Gaussians cannot have {k} neighbours each: use at most {max(n - 1, 0)} neighbours, "
@@ -112,16 +117,6 @@ def _kernel(device: torch.device, dtype: torch.dtype, k: int) -> Kernel | None:
     except BackendError as error:
         _log.warning("neighbour search runs on the CPU, not on %s: %s", device, error)
         return None
-
-
-def _check(points: Tensor) -> None:
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise DataError(f"positions have shape {list(points.shape)}: pass [N, 3]")
-    bad = int((~torch.isfinite(points)).any(dim=1).sum())
-    if bad:
-        raise DataError(f"{bad} of {len(points)} positions are NaN or infinite: drop them before building a graph")
-    if points.dtype == torch.float64 and len(points) and float(points.detach().abs().max()) > MOST_EXTENT:
-        raise DataError(f"positions exceed {MOST_EXTENT:g}: their squared distances overflow, scale the scene")
 
 
 def kernel_options(dtype: torch.dtype, k: int) -> tuple[str, ...]:
