@@ -216,7 +216,7 @@ def box_of(means: Tensor, weights: Tensor, share: float = 0.99) -> list[float]:
     sides = values.T.gather(1, torch.searchsorted(sums, torch.cat([cut, sums[:, -1:] - cut], dim=1))).tolist()
     digits = 3 - math.floor(math.log10(max(high - low for low, high in sides) or 1.0))
     low = [round(math.floor(low * 10.0**digits) / 10.0**digits, digits) for low, _ in sides]
-    return low + [round(math.ceil(high * 10.0**digits) / 10.0**digits, digits) for _, high in sides]
+    return low + [round((math.floor(high * 10.0**digits) + 1) / 10.0**digits, digits) for _, high in sides]  # not flat
 
 
 def for_cleaning(cameras: Sequence[Camera]) -> list[Camera]:

@@ -141,3 +141,4 @@ def test_a_box_holds_the_share_that_is_asked_for():
     assert 0.9 <= float(weights[inside].sum() / weights.sum()) < 0.95
     assert box[3] < 40
     assert numbers == [round(number, 2) for number in numbers], "they are short"
+    assert box_of(torch.ones(2, 3), torch.ones(2)) == [1.0] * 3 + [1.001] * 3, "a box of no width would be refused"

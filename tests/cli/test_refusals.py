@@ -71,7 +71,6 @@ REFUSALS = {
     "compare in.ply -o out": "needs two scenes; give another, --formats, or --data with a capture",
     "compare in.ply --data none": "none does not exist; give the folder of the capture with --data",
     "compare in.ply gone.ply": "gone.ply does not exist",
-    "compare in.ply -o used": "--overwrite",
     "compare in.ply -o . --overwrite": "holds what the command reads",
     "view damaged.json": "damaged.json is no run; give a run, its config.yml, or a .sundae",
     "export trained/point_cloud -o a.html": "trained/point_cloud is no run; give a run",
