@@ -37,7 +37,7 @@ _UNREAD = {
     ".html": "is a web page; give the scene that it was made of",
     ".gltf": "is a glTF scene in several files; export it as .glb",
     ".pth": "is a checkpoint of another trainer; give its .ply, such as point_cloud/iteration_*/point_cloud.ply",
-    **dict.fromkeys(".rar .7z .tar .tgz .xz .zst".split(), "is an archive; unpack it, and give the scene in it"),
+    **dict.fromkeys(".rar .7z .tar .tgz .xz .zst .ssproj".split(), "is an archive; unpack it, and give its scene"),
 }
 _READERS: dict[Kind | None, Reader] = {"spz": read_spz, "sog": read_sog, "glb": read_glb}
 _READERS |= {"splat": read_splat, "ksplat": read_ksplat, "gsplat": read_gsplat}

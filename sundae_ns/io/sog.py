@@ -179,7 +179,7 @@ def read_sog(path: Path) -> tuple[dict[str, Tensor], Marks]:
     Returns Gaussians as of ``ply.read_ply``, their means in float64, and what it states of them. Of streamed SOG, which
     may be a .zip too, these are the finest level and the environment.
     """
-    with reading(path, "a complete .sog"), ExitStack() as stack:
+    with reading(path, "a complete .sog", remedy="export it again, or unzip it"), ExitStack() as stack:
         if path.is_dir() or path.name in METAS:
             folder = path if path.is_dir() else path.parent
             streamed = path.name != META and (path.name == STREAMED or (folder / STREAMED).exists())
@@ -249,7 +249,7 @@ def _bundled(bundle: zipfile.ZipFile, size: int, *, inner: bool = False) -> tupl
     if len(scenes) == 1 and not metas and not inner:
         return _bundled(zipfile.ZipFile(io.BytesIO(_zip_entry(bundle, size, "", scenes[0]))), size, inner=True)
     if len(metas) != 1:
-        raise ValueError(f"it holds {len(metas)} {META} and {len(scenes)} .sog, not one of them; unzip other scenes")
+        raise ValueError(f"it holds {len(metas)} {META} and {len(scenes)} .sog, not one of them")
     return partial(_zip_entry, bundle, size, metas[0].removesuffix(main)), main == STREAMED
 
 

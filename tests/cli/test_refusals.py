@@ -67,7 +67,7 @@ REFUSALS = {
     "pack gone -o a.sundae --target-drop 1 --max-mb 9": "exclude each other",
     "compare a.lcc in.ply -o out": "a.lcc is a scene of XGRIDS; convert it to .ply with",
     "info a.usdz": "a.usdz is a scene of OpenUSD; export its Gaussians as .ply or .glb",
-    "info a.7z": "a.7z is an archive; unpack it, and give the scene in it",
+    "info a.ssproj": "a.ssproj is an archive; unpack it, and give its scene",
     "compare in.ply -o out": "needs two scenes; give another, --formats, or --data with a capture",
     "compare in.ply --data none": "none does not exist; give the folder of the capture with --data",
     "compare in.ply gone.ply": "gone.ply does not exist",
@@ -135,7 +135,7 @@ def inputs(tmp_path_factory):
         nan = b"\xff" * (len(values) // 200 * count)
         (folder / name).write_bytes(header.replace(b"vertex 200", b"vertex %d" % count) + b"end_header\n" + nan)
     contents = {"in.bin": b"\x1f\x8b\xff", "damaged.json": b"{"}
-    contents |= dict.fromkeys("a.ksplat a.lcc a.glb a.pth a.splat page.html a.7z a.usdz".split(), bytes(33))
+    contents |= dict.fromkeys("a.ksplat a.lcc a.glb a.pth a.splat page.html a.ssproj a.usdz".split(), bytes(33))
     contents |= {"text.mp4": b"not a video", "trained/point_cloud/iteration_30000/point_cloud.ply": b""}
     contents["trained/point_cloud/iteration_7000/point_cloud.ply"] = b""  # written later
     empty = "scene/transforms.json", "model/sparse/0/cameras.bin", "blender/transforms_train.json", "used/thesis.txt"
