@@ -158,8 +158,8 @@ def checked(params: Mapping[str, Any]) -> Gaussians:
     if not bool(torch.stack(limits).isfinite().all()):
         if wrong := sanitise(values).dropped:
             raise DataError(f"{wrong:,} of {num_gaussians(values):,} Gaussians are NaN or infinite; remove these rows")
-    if not values["quats"].requires_grad and bool((values["quats"].abs().amax(dim=1).log10().abs() > 15).any()):
-        values["quats"] = sanitise(values).gaussians["quats"]  # whose squares float32 has
+    if not values["quats"].requires_grad and bool((values["quats"].abs().amax(dim=1).log10().abs() > 6).any()):
+        values["quats"] = sanitise(values).gaussians["quats"]  # which rasterisers can normalise
     return gaussians if all(values[name] is value for name, value in gaussians.items()) else gaussians.replaced(values)
 
 

@@ -91,7 +91,7 @@ def test_cameras_and_numbers_of_every_type():
     assert dataclasses.replace(made, antialiased=True).gaussians is made.gaussians
     assert sn.transform(sn.Scene.from_points([[0.1, 0, 0]], [[0.5] * 3]), scale=3).means.sum() == np.float32(0.3)
     turns = np.random.default_rng(0).normal(size=(100, 4))
-    for factor in (1e-30, 1e30):
+    for factor in (1e-30, 1e-13, 1e30):
         torch.testing.assert_close(arrays(quats=factor * turns).quats, arrays(quats=turns).quats)
         torch.testing.assert_close(sn.Scene({**params, "quats": factor * turns}).quats, arrays(quats=turns).quats)
     for eye in ((0, 0, 2), (0, 0, -2), (-2, 0, 0)):
