@@ -113,7 +113,7 @@ def checked(path: Path, params: Mapping[str, Tensor]) -> dict[str, Tensor]:
     if not len(gaussians["means"]):
         raise DataError(f"the scene has no Gaussians, which a {path.suffix} cannot store; check the run")
     if not all(bool(value.isfinite().all()) for value in (*gaussians.values(), gaussians["scales"].exp())):
-        raise DataError("some values are NaN or infinite; drop those Gaussians first (finite_mask)")
+        raise DataError("some values are NaN or infinite, or widths beyond float32; remove those Gaussians first")
     if gaussians["features_rest"].shape[1] > (STORED_SH_DEGREE + 1) ** 2 - 1:
         raise DataError(f"{path.suffix} stores SH degrees up to {STORED_SH_DEGREE}; cut features_rest, or write a .ply")
     # Opacities beyond these logits are 0 and 1 in every format, and would overflow before they are.
