@@ -79,7 +79,7 @@ def _dispatch(words: Sequence[str]) -> int:
     # Only the module of this command: some import torch, which takes a second.
     run = getattr(importlib.import_module(f"sundae_ns.cli.{name}"), name)
     messages, later = io.StringIO(), wraps(run)(lambda *given, **named: partial(run, *given, **named))
-    run.__doc__ = re.sub(r"\n {12}(?=\S)", " ", run.__doc__)  # the help would keep the line breaks of arguments
+    run.__doc__ = re.sub(r"\n {12}(?=\S)", " ", run.__doc__ or "")  # the help would keep the line breaks of arguments
     try:
         with redirect_stderr(messages):
             chosen = tyro.cli(later, prog=f"sundae {name}", args=options)

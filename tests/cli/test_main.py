@@ -73,7 +73,7 @@ def test_torch_is_not_loaded_before_a_command_starts():
 
 def test_the_installed_command_takes_any_name_and_no_warning_for_an_error(tmp_path):
     """Names of files may hold bytes that are no text."""
-    environment = {**os.environ, "PYTHONWARNINGS": "error", "PYTHONUTF8": "1"}
+    environment = {**os.environ, "PYTHONWARNINGS": "error", "PYTHONUTF8": "1", "PYTHONOPTIMIZE": "2"}  # no docstrings
     done = subprocess.run([SUNDAE, "train", b"\n\xff"], cwd=tmp_path, env=environment, capture_output=True, check=False)
     assert done.stderr == b"sundae: \\n\\udcff does not exist; check the path\n"
     assert (done.returncode, done.stdout) == (2, b"")
