@@ -193,7 +193,7 @@ def test_axes_that_are_no_rotation_are_refused(capture, load, edit, place, value
     spoilt = np.eye(4)
     spoilt[place] = value
     change_poses(capture, edit, lambda index, pose: spoilt @ pose if index == 1 else pose)
-    words = "its first three columns are not a rotation" if place[0] < 3 else "last row .* is not 0 0 0 1; exchange"
+    words = "the first three columns are not a rotation" if place[0] < 3 else "last row .* is not 0 0 0 1; exchange"
     with pytest.raises(DataError, match=f"frame 1 .*{words}"):
         load(capture)
 
