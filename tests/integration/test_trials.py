@@ -202,7 +202,7 @@ def test_a_head_in_any_case_rests_during_the_trials_and_counts_its_own_steps(mak
     ("options", "kept", "said"),
     [
         ({"prune_at": 75}, 20, "10% of the Gaussians: the steps after the prune are too few"),
-        ({"views": 16}, 13, "7% of the Gaussians: 16 training views are too few"),
+        ({"views": 16}, 20, "10% of the Gaussians: 16 training views are too few"),
     ],
 )
 def test_where_trials_cannot_decide_a_share_is_kept_and_one_line_says_so(make_counting, options, kept, said, capsys):
