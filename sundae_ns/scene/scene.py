@@ -288,7 +288,7 @@ def usable_cameras(cameras: Any) -> tuple[Camera, ...]:
 
 
 def _are_pinholes(views: Tensor, K: Tensor) -> bool:
-    """Whether matrices ``[V, 4, 4]`` and ``[V, 3, 3]`` are pinholes without skew, of which rasterisers read all."""
+    """Whether matrices ``[V, 4, 4]`` and ``[V, 3, 3]`` are pinhole cameras without skew, which all rasterisers read."""
     axes, eye = views[:, :3, :3], torch.eye(4, device="cpu")
     plain = torch.equal(K * K.new_tensor([[1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]]), K)
     turned = ((axes @ axes.mT - eye[:3, :3]).abs() < 0.25).all() & (axes.det() > 0).all() & views.isfinite().all()
