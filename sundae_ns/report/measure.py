@@ -32,7 +32,6 @@ from sundae_ns.scene.frames import FrameReplay
 from sundae_ns.scene.load_save import load
 from sundae_ns.scene.render import GaussianSource, RenderSettings, compensate, draw, scale_plan
 from sundae_ns.scene.scene import Scene, render
-from sundae_ns.scene.virtual_cameras import of_unit_size, resized
 
 if TYPE_CHECKING:
     from sundae_ns.plugin.finished_runs import Opened
@@ -197,15 +196,13 @@ def against_photos(data: Path | None) -> Callable[[Path], Subject]:
 
 def against_first(path: Path, reference: Scene, cameras: Sequence[Camera]) -> Callable[[Path], Subject]:
     """A function that opens scenes in views of the scene at a path, ``reference``, whose images are the truth."""
-    unit, scaled, size = of_unit_size(reference, cameras)
-    views = [(camera, render(unit, camera).rgb) for camera in scaled]
+    views = [(camera.to(reference.device), render(reference, camera).rgb) for camera in cameras]
 
     def subject(other: Path) -> Subject:
         if other == path:
-            return Subject.of_file(unit, path, path.name, [])
-        scene = replace(aligned(load(other), reference), background_color=reference.background_color).to(unit.device)
-        scene = replace(scene, gaussians=resized(scene.gaussians, 1 / size))
-        return Subject.of_file(scene, other, path.name, views)
+            return Subject.of_file(reference, path, path.name, [])
+        scene = replace(aligned(load(other), reference), background_color=reference.background_color)
+        return Subject.of_file(scene.to(reference.device), other, path.name, views)
 
     return subject
 

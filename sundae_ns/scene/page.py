@@ -27,8 +27,7 @@ from sundae_ns.core.files import write_files
 from sundae_ns.core.values import whole
 from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.scene.cameras import opening
-from sundae_ns.scene.scene import Scene, image_of, render
-from sundae_ns.scene.virtual_cameras import middle_and_reach, usable
+from sundae_ns.scene.scene import Scene, image_of, middle_and_reach, render, usable
 
 LARGE = 10_000_000  # bytes of a page from which show() warns: notebooks load all of their outputs at once
 _log = logging.getLogger(__name__)

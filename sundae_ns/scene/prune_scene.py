@@ -132,7 +132,7 @@ def fitted(pruned: PrunedScene, full: Scene, cameras: Sequence[Camera], rule: Pr
     if pruned.seen_share is None or not rule.refits:
         return pruned
     unit, scaled, size = of_unit_size(full, cameras)
-    small, settings = resized(pruned.scene.gaussians, 1 / size), full.settings(head=False)
+    small, settings = resized(pruned.scene.gaussians, 1 / size), unit.settings(head=False)
     small = refit(small, unit.gaussians, scaled, settings, seed=rule.seed, **options)
     return pruned._replace(scene=dataclasses.replace(pruned.scene, gaussians=resized(small, size)))
 
@@ -149,7 +149,7 @@ def weights_in(
         images = None  # a refit reads smaller ones
     sized, scaled, _ = of_unit_size(scene, [at_most(camera, MOST_PIXELS) for camera in cameras])
     views = [(camera, None) for camera in scaled]
-    source, settings = GaussianSource(sized.gaussians), scene.settings(head=False)
+    source, settings = GaussianSource(sized.gaussians), sized.settings(head=False)
     weights = contribution(source, views, scene.background, settings, count, images=images, console=console)
     if not bool((weights > 0).any()):
         raise DataError(f"{len(scaled)} views see none of {len(scene):,} Gaussians; give others, or export it again")
@@ -234,7 +234,6 @@ def count_for_drop(
     """
     if len(cameras) < 2:
         raise ConfigError("a target needs two views or more, because one of them is held out; give more views")
-    scene, cameras, _ = of_unit_size(scene, cameras)
     trained, held_out = split(cameras)
     tolerated = 1e-3 * (10 ** (drop / 10) - 1)  # mean squared error
     n, before = sanitise(scene.gaussians).gaussians.num_gaussians, 0.0

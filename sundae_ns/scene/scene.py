@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -15,7 +16,7 @@ from torch import Tensor
 
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import BackendError, ConfigError, DataError, one_line
-from sundae_ns.core.gaussians import FEATURES, MAX_SH_DEGREE, Gaussians, checked, rgb_to_sh, sh_to_rgb
+from sundae_ns.core.gaussians import FEATURES, MAX_SH_DEGREE, Gaussians, checked, rgb_to_sh, sanitise, sh_to_rgb
 from sundae_ns.core.metrics import Quality, evaluate
 from sundae_ns.core.values import AnyArray, fitting, floats, numbers, positions, whole
 from sundae_ns.cuda.kernels import naming_full_memory
@@ -194,6 +195,12 @@ class Scene:
         """Device of the Gaussians and the head."""
         return self.means.device
 
+    @cached_property
+    def extent(self) -> float:
+        """Median distance of the Gaussians from their middle, world units; 1 in nerfstudio's model, or without any."""
+        finite = sanitise(self.gaussians).gaussians
+        return 1.0 if self.in_model_frame or not finite.num_gaussians else middle_and_reach(finite)[1]
+
     @property
     def background(self) -> Tensor:
         """Colour behind the scene ``[3]``, on the device of the scene."""
@@ -219,9 +226,10 @@ class Scene:
     @fitting()
     def settings(self, backend: BackendName = "auto", *, head: bool = True) -> RenderSettings:
         """Settings that render the scene with all of its SH degrees; ``BackendError`` without the rasteriser."""
-        rasteriser = select_backend(backend, self.device)
-        enabled = self.head if head else None
-        return RenderSettings(rasteriser, antialiased=self.antialiased, head=enabled, trained_focal=self.trained_focal)
+        rasteriser, enabled = select_backend(backend, self.device), self.head if head else None
+        near = min(NEAR_PLANE, self.extent / 10)  # a scene of millimetres would lie behind the usual one
+        settings = RenderSettings(rasteriser, head=enabled, trained_focal=self.trained_focal, near_plane=near)
+        return replace(settings, antialiased=self.antialiased)
 
     def __repr__(self) -> str:
         head = "no head" if self.head is None else f"{self.head.config.size} head"
@@ -301,6 +309,22 @@ def within(mask: Tensor, inner: Tensor) -> Tensor:
     return mask.masked_scatter(mask, inner)
 
 
+def usable(scene: Scene) -> Gaussians:
+    """The finite Gaussians, detached."""
+    if not (gaussians := sanitise(scene.gaussians).gaussians).num_gaussians:
+        raise DataError(f"none of {scene.num_gaussians:,} Gaussians is finite, so no camera sees the scene")
+    return Gaussians({name: value.detach() for name, value in gaussians.items()}, gaussians.encoding)
+
+
+def middle_and_reach(gaussians: Gaussians) -> tuple[Tensor, float]:
+    """Median of the centres ``[3]``, float64 on the CPU, and their median distance from it; in one place, a size."""
+    means = gaussians["means"].double()
+    middle = means.median(dim=0).values
+    if (reach := float((means - middle).norm(dim=1).median())) == 0:
+        reach = 3 * float(gaussians["scales"].double().amax(dim=1).median().exp())
+    return middle.cpu(), max(reach, 1e-30)
+
+
 class Rendering(NamedTuple):
     """Images of one view, float32 on the device of the scene."""
 
@@ -342,10 +366,6 @@ def render(scene: Scene, camera: Camera, *, head: bool = True, backend: BackendN
     """
     (camera,) = usable_cameras((camera,))
     settings = scene.settings(backend, head=head)
-    if not scene.in_model_frame:  # a scene of millimetres would lie behind the usual near plane
-        some = scene.means.detach()[:: -(-len(scene) // 1024)]
-        size = float((some - some.median(dim=0).values).norm(dim=1).median())
-        settings = replace(settings, near_plane=min(NEAR_PLANE, size / 10) or NEAR_PLANE)
     wanted = any(value.requires_grad for value in (*scene.gaussians.values(), camera.viewmat, camera.K))
     wanted |= settings.head is not None and settings.head.training
     with naming_full_memory(lambda: scene.num_gaussians), torch.set_grad_enabled(wanted and torch.is_grad_enabled()):

@@ -13,12 +13,11 @@ from torch import Tensor
 
 from sundae_ns.core.camera import Camera, poses_looking_at, world_to_camera
 from sundae_ns.core.covariance import chunks
-from sundae_ns.core.errors import DataError
-from sundae_ns.core.gaussians import Gaussians, sanitise
+from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.core.values import whole
 from sundae_ns.rasterize.interface import rasterize_cameras
 from sundae_ns.scene.render import pass_inputs
-from sundae_ns.scene.scene import Scene
+from sundae_ns.scene.scene import Scene, middle_and_reach, usable
 
 FOV = 40.0
 VIEWS = {"cpu": 128, "cuda": 256}  # largest default number of cameras, by the device
@@ -137,22 +136,13 @@ def of_unit_size(scene: Scene, cameras: Sequence[Camera]) -> tuple[Scene, list[C
 
     The size is the median distance of the Gaussians from their middle; 1 for nerfstudio's model, which stays as it is.
     """
-    size = 1.0 if scene.in_model_frame else middle_and_reach(usable(scene))[1]
+    size = scene.extent
     divisors = torch.ones(4, 4)
     divisors[:3, 3] = size  # of translations
     scaled = [each._replace(viewmat=each.viewmat / divisors.to(each.viewmat)).to(scene.device) for each in cameras]
     if size != 1:
         scene = dataclasses.replace(scene, gaussians=resized(scene.gaussians, 1 / size), cameras=())
     return scene, scaled, size
-
-
-def middle_and_reach(gaussians: Gaussians) -> tuple[Tensor, float]:
-    """Median of the centres ``[3]``, float64 on the CPU, and their median distance from it; in one place, a size."""
-    means = gaussians["means"].double()
-    middle = means.median(dim=0).values
-    if (reach := float((means - middle).norm(dim=1).median())) == 0:
-        reach = 3 * float(gaussians["scales"].double().amax(dim=1).median().exp())
-    return middle.cpu(), max(reach, 1e-30)
 
 
 def at_most(camera: Camera, pixels: int) -> Camera:
@@ -168,13 +158,6 @@ def split(cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:
 def resized(gaussians: Gaussians, factor: float) -> Gaussians:
     """The Gaussians, ``factor`` times as large."""
     return gaussians.replaced({"means": gaussians["means"] * factor, "scales": gaussians["scales"] + math.log(factor)})
-
-
-def usable(scene: Scene) -> Gaussians:
-    """The finite Gaussians, detached."""
-    if not (gaussians := sanitise(scene.gaussians).gaussians).num_gaussians:
-        raise DataError(f"none of {scene.num_gaussians:,} Gaussians is finite, so no camera sees the scene")
-    return Gaussians({name: value.detach() for name, value in gaussians.items()}, gaussians.encoding)
 
 
 def _probe(scene: Scene, gaussians: Gaussians, generator: torch.Generator) -> tuple[Scene, Tensor, Tensor, float]:
