@@ -218,24 +218,28 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         for index in self.train_indices:
             # Read the mask first: undistortion changes the camera.
             mask = self.cached_train[index].get("mask") if masked else None
-            yield self.train_dataset.cameras[index : index + 1], mask
+            yield self._camera(index), mask
 
     def cameras(self, indices: Iterable[int]) -> Iterator[tuple[Cameras, dict[str, Tensor]]]:
         """Training views as camera and batch, loaded one at a time."""
-        return map(self._camera, indices)
+        return map(self._view, indices)
 
-    def _camera(self, index: int) -> tuple[Cameras, dict[str, Tensor]]:
+    def _view(self, index: int) -> tuple[Cameras, dict[str, Tensor]]:
         batch = dict(self.cached_train[index])  # first: undistortion, which comes with it, changes the camera
         batch["image"] = batch["image"].to(self.device, non_blocking=True)  # pinned in host memory
-        if index not in self._cameras:  # nerfstudio's slicing is slow
+        return self._camera(index), batch
+
+    def _camera(self, index: int) -> Cameras:
+        """Camera of a training view, kept because nerfstudio's slicing is slow; its index is for a camera optimizer."""
+        if index not in self._cameras:
             camera = self.train_dataset.cameras[index : index + 1]
             camera.metadata = {**(camera.metadata or {}), "cam_idx": index}
             self._cameras[index] = camera
-        return self._cameras[index], batch
+        return self._cameras[index]
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Tensor]]:
         """Camera (on the CPU) and batch of ``step``."""
-        return self._camera(self.view_of_step(step + self.rank))
+        return self._view(self.view_of_step(step + self.rank))
 
     def _load_images(
         self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]

@@ -55,6 +55,7 @@ def test_held_back_views_are_not_trained_on_and_are_loaded_when_their_turn_comes
     assert {made.view_of_step(step) for step in range(50)} == set(range(VIEWS)) - {2, 5}
     cameras, masks = zip(*made.training_views(), strict=True)  # a prune looks at all of them
     assert masks == (None,) * VIEWS
+    assert [camera.metadata["cam_idx"] for camera in cameras] == made.train_indices, "a camera optimizer moves them"
     poses = torch.cat([camera.camera_to_worlds for camera in cameras])
     assert torch.equal(poses, made.train_dataset.cameras.camera_to_worlds)
     (camera, batch), _ = made.cameras(made.held_out_indices)
@@ -62,7 +63,7 @@ def test_held_back_views_are_not_trained_on_and_are_loaded_when_their_turn_comes
     assert torch.equal(camera.camera_to_worlds[0], made.train_dataset.cameras.camera_to_worlds[2])
     assert batch["image"].shape == (SIDE, SIDE, 3)
     moved = []
-    monkeypatch.setattr(made, "_camera", moved.append)
+    monkeypatch.setattr(made, "_view", moved.append)
     rest = made.cameras(made.held_out_indices)
     assert moved == []
     next(rest)
