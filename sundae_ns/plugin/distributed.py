@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import logging
 import multiprocessing
 import os
 import signal
@@ -191,6 +192,8 @@ class Ranks:
         config = copy.deepcopy(config)
         config.vis = "tensorboard" if config.vis in ("viewer", "viewer_legacy") else config.vis.removeprefix("viewer+")
         CONSOLE.quiet = self.rank != 0
+        if self.rank > 0:  # the first rank logs the same
+            logging.getLogger("sundae_ns").setLevel(logging.ERROR)
         if config.machine.device_type == "cuda":
             torch.cuda.set_device(self.rank)
         return config

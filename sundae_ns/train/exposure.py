@@ -85,6 +85,7 @@ class ExposureCompensation(Callback):
         self._state, self._rows = run.state, np.asarray(indices)
         positions = view_points([camera for camera, _ in run.training_views()]).cpu()
         self._smoother = Smoother(build_graph(positions, num_neighbors=NEIGHBORS), SMOOTHING)
+        self._sums, self._gains = self._sums.to(run.state.device), self._gains.to(run.state.device)
         if run.images_per_step > 1:  # of the first rank alone
             self._sums.zero_()
 
@@ -103,7 +104,6 @@ class ExposureCompensation(Callback):
         """
         if (index := _index(batch)) is None or self._smoother is None or self._state.step % MEASURED_EVERY:
             return
-        self._sums, self._gains = self._sums.to(photo.device), self._gains.to(photo.device)
         apart = max(int((photo.shape[0] * photo.shape[1] / SAMPLE) ** 0.5), 1)
         rendered, taken = image[::apart, ::apart].detach(), photo[::apart, ::apart] * self._gains[index]
         counts = taken.amax(dim=2, keepdim=True) < CLIPPED

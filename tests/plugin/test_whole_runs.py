@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import json
+import logging
 import multiprocessing
 import os
 import re
@@ -101,6 +102,7 @@ def check_training(rank, folder):
     config.vis = "viewer+tensorboard"
     trainer = train(config, rank, RANKS)
     assert (trainer.config.vis, config.vis) == ("tensorboard", "viewer+tensorboard")
+    assert logging.getLogger("sundae_ns.train").isEnabledFor(logging.WARNING) == (rank == 0), "each line is logged once"
     model = trainer.pipeline.model
     weights = torch.cat([value.detach().flatten() for value in model.head.parameters()])
     every = [torch.empty_like(weights) for _ in range(RANKS)]

@@ -19,15 +19,15 @@ def ring(count=COUNT):
     return [Camera.look_at((3 * math.cos(a), 3 * math.sin(a), 1.0), (0, 0, 0), width=64, height=48) for a in angles]
 
 
-def run_of(cameras, *, ranks=1):
+def run_of(cameras, device="cpu"):
     indices = list(range(len(cameras)))
     shown = [(camera, None) for camera in cameras]
-    members = {"view_indices": lambda: indices, "training_views": lambda: shown, "images_per_step": ranks}
-    return SimpleNamespace(state=SimpleNamespace(step=0), **members)
+    members = {"view_indices": lambda: indices, "training_views": lambda: shown, "images_per_step": 1}
+    return SimpleNamespace(state=SimpleNamespace(step=0, device=torch.device(device)), **members)
 
 
-def begin(mode="on"):
-    gains, run = ExposureCompensation(COUNT, mode), run_of(ring())
+def begin(mode="on", device="cpu"):
+    gains, run = ExposureCompensation(COUNT, mode), run_of(ring(), device)
     gains.before_training(run)
     return gains, run
 

@@ -140,6 +140,8 @@ def test_ranks_add_up_what_each_has_measured():
     measure(gains, run, image_of, rounds=1)
     assert gains.state_dict()["measured"][9].min() > 0
     assert gains.state_dict()["measured"][8].abs().max() < 1e-6
+    unseen, _ = begin(device="meta")  # as of photos with an alpha channel
+    assert unseen.state_dict()["sums"].is_meta, "ranks add up what is on their GPUs"
 
 
 def test_cameras_at_one_place_are_apart_by_what_they_see():
