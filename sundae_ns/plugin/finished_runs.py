@@ -47,6 +47,7 @@ from sundae_ns.scene.compose import transform
 from sundae_ns.scene.load_save import load, no_scene, scene_of_checkpoint
 from sundae_ns.scene.packing import refusal
 from sundae_ns.scene.scene import Scene, measure, unit
+from sundae_ns.train.build import STOCK_ONLY
 from sundae_ns.train.pruning import PruningConfig
 
 _PARSERS: dict[str, type[DataParserConfig]] = {
@@ -149,11 +150,10 @@ def _open_run(path: Path, data: Path | None, split: Literal["test", "val"]) -> O
     newest, loaded = checkpoint.read_newest(path.parent / config.relative_model_dir)
     manager = config.pipeline.datamanager = _datamanager_config(config.pipeline.datamanager)
     stock = config.pipeline.model
+    vars(stock).update(dict.fromkeys(STOCK_ONLY, False))  # of training: test views are rendered without them
     if foreign := not isinstance(stock, SundaeModelConfig):
-        # The grid corrects training images only; test views are rendered without it.
-        shared = {**_shared(stock, SplatfactoModelConfig), "use_bilateral_grid": False}
         parts: Any = {"pruning": PruningConfig(mode="off"), "head": HeadConfig(mode="off")}
-        config.pipeline.model = SundaeModelConfig(**shared, **parts)
+        config.pipeline.model = SundaeModelConfig(**_shared(stock, SplatfactoModelConfig), **parts)
     # The datamanager's path first: it follows a capture that has moved together with the run.
     capture = data or Path(manager.data or config.data or manager.dataparser.data)
     if not capture.exists():

@@ -29,11 +29,13 @@ from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.io import checkpoint, run_folder
 from sundae_ns.io.config_file import find_capture
 from sundae_ns.plugin import distributed
-from sundae_ns.plugin.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
+from sundae_ns.plugin.datamanager import SundaeDatamanagerConfig
 from sundae_ns.plugin.dataparsers import check_capture, warn_of_other_frame
 from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.plugin.optimizer_configs import HARMONICS_EVERY, FusedAdamConfig
 from sundae_ns.plugin.viewer import stop_rendering
+from sundae_ns.pruning.decision import diverged
+from sundae_ns.train.build import check
 from sundae_ns.train.graphed_step import RecordedStep
 from sundae_ns.train.progress import Interruption, loaded_run, long_on_cpu, resume_command
 from sundae_ns.train.schedules import schedule_table, set_schedule
@@ -60,6 +62,7 @@ class SundaeTrainerConfig(TrainerConfig):
         datamanager = self.pipeline.datamanager
         if isinstance(datamanager, SundaeDatamanagerConfig):
             check_capture(datamanager.dataparser, datamanager.capture, ("train", "val"))
+        check(self.pipeline.model)
         from nerfstudio.configs.method_configs import all_methods  # imports the entry points, so not at the top
 
         set_schedule(self, all_methods.get(str(self.method_name)), sys.argv[1:])
@@ -82,8 +85,7 @@ class SundaeTrainerConfig(TrainerConfig):
     def get_base_dir(self) -> Path:
         """Folder of the run: where a command of nerfstudio has found it, for a run that was copied or moved."""
         if (run := loaded_run(sys.argv)) is None or not (run / self.relative_model_dir).is_dir():
-            base: Path = super().get_base_dir()
-            return base
+            return cast(Path, super().get_base_dir())
         find_capture(self, run)
         return run
 
@@ -106,6 +108,7 @@ class SundaeTrainer(Trainer):
     """Saves atomically, resumes from the newest whole checkpoint, and restores the random generators."""
 
     config: SundaeTrainerConfig
+    pipeline: Any  # nerfstudio's, of our model and our datamanager
 
     def __init__(self, config: SundaeTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         self.ranks = distributed.Ranks(local_rank, world_size)
@@ -137,10 +140,6 @@ class SundaeTrainer(Trainer):
     def model(self) -> SundaeModel:
         """The model in training."""
         return cast(SundaeModel, self.pipeline.model)
-
-    @property
-    def _datamanager(self) -> SundaeDatamanager:
-        return cast(SundaeDatamanager, self.pipeline.datamanager)
 
     @property
     def last_step(self) -> int:
@@ -222,7 +221,7 @@ class SundaeTrainer(Trainer):
         if self._recorded is None:
             return None
         model = self.model
-        camera, batch = self._datamanager.next_train(step)
+        camera, batch = self.pipeline.datamanager.next_train(step)
         inputs = model.step_inputs(camera, batch)
         if (result := self._recorded(model.state, inputs, model.render_settings(training=True))) is None:
             self._recorded = None
@@ -285,6 +284,9 @@ class SundaeTrainer(Trainer):
         with self.ranks.gathered() as first:
             if not first:
                 return
+            sums = [value.detach().flatten(1).sum(dim=1) for value in self.model.gauss_params.values()]
+            if not bool(torch.stack(sums).isfinite().all(dim=0).any()):  # a save would replace a good checkpoint
+                raise diverged(self.model.num_points)
             state = {
                 "step": step,
                 "pipeline": self.pipeline.state_dict(),
@@ -316,7 +318,7 @@ class SundaeTrainer(Trainer):
             if "random" in loaded:  # nerfstudio's own trainer saves none
                 checkpoint.set_random_state(loaded["random"])
         _log.info(f"Resuming after step {loaded['step']} from {path}")
-        outputs = self._datamanager.train_dataparser_outputs
+        outputs = self.pipeline.datamanager.train_dataparser_outputs
         warn_of_other_frame(path.parent.parent, outputs.dataparser_transform, outputs.dataparser_scale)
 
     def _source(self) -> Path | None:

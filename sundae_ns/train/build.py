@@ -8,7 +8,7 @@ from typing import Any, cast
 import torch
 
 from sundae_ns.core.errors import ConfigError
-from sundae_ns.core.gaussians import Gaussians
+from sundae_ns.core.gaussians import MAX_SH_DEGREE, Gaussians
 from sundae_ns.head.head import CompensationHead
 from sundae_ns.train.averaging import Averaging
 from sundae_ns.train.densification import Densification, make_strategy
@@ -18,26 +18,30 @@ from sundae_ns.train.pruning import UNPRUNED, FloaterRemoval, ScheduledPruning
 from sundae_ns.train.state import Callback, TrainingState
 from sundae_ns.train.trials import AfterPrune, Trials
 
+STOCK_ONLY = ("use_bilateral_grid", "use_scale_regularization", "color_corrected_metrics")
+"""Options of splatfacto that nothing here reads; a head would learn against what a bilateral grid does."""
+
 
 def check(options: Any) -> None:
     """Check options that cannot work, alone or together; raises a ConfigError with the first one and its remedy."""
     options.pruning.validate()
     if options.head.mode != "off":
         options.head.validate()
-    for name, most, remedy in (
-        ("base-loss-weight", math.inf, "0 or more"),
-        ("prior-after-prune", math.inf, "0 or more"),
-        ("dense-start-views", math.inf, "a number of images, 0 for no sweep"),
-        ("average-share", 1, "a share of the schedule, 0.1 for the last tenth"),
-        ("drop-rate", 0.9, "a share of the Gaussians, 0.2 for few photos"),
+    for names, least, most, remedy in (
+        (("base_loss_weight", "prior_after_prune", "dense_start_views"), 0, math.inf, "0 or more"),
+        (("num_random", "refine_every", "reset_alpha_every", "resolution_schedule"), 1, math.inf, "1 or more"),
+        (("average_share",), 0, 1, "a share of the schedule, 0.1 for the last tenth"),
+        (("drop_rate",), 0, 0.9, "a share of the Gaussians, 0.2 for few photos"),
+        (("ssim_lambda",), 0, 1, "a share of the loss, 0.2 for the usual one"),
+        (("sh_degree",), 0, MAX_SH_DEGREE, f"0 to {MAX_SH_DEGREE}"),
+        (STOCK_ONLY, 0, 0, "False: only splatfacto has it"),
     ):
-        value = getattr(options, name.replace("-", "_"))
-        if value is not None and not 0 <= value <= most:
-            raise ConfigError(f"{name} is {value}; give {remedy}")
+        for name in names:
+            value = getattr(options, name)
+            if value is not None and not least <= value <= most:
+                raise ConfigError(f"{name.replace('_', '-')} is {value}; give {remedy}")
     if options.warm_start is not None and options.pruning.mode == "continuous":
         raise ConfigError("a warm start is pruned at once, not while it grows: set pruning.mode to one-shot")
-    if options.use_bilateral_grid:
-        raise ConfigError("sundae has no bilateral grid: the head would learn against it; use splatfacto for it")
 
 
 def build(

@@ -19,7 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torch import Tensor
 from trial_runs import same, served_views
 
-from sundae_ns.core.errors import BackendError, MemoryExhaustedError
+from sundae_ns.core.errors import BackendError, DataError, MemoryExhaustedError
 from sundae_ns.core.gaussians import SPLAT_NAMES
 from sundae_ns.io import checkpoint
 from sundae_ns.io.ply import MODEL_FRAME, write_ply
@@ -217,6 +217,14 @@ def test_full_memory_in_the_backward_pass(tiny, resumed, monkeypatch):
         trainer.train()
 
 
+def test_a_diverged_field_takes_the_place_of_no_checkpoint(tiny, resumed):
+    trainer = resumed(tiny.checkpoints, 60, 5)
+    trainer.model.gauss_params["opacities"].data.fill_(torch.nan)
+    with pytest.raises(DataError, match="the training has diverged, go back to an earlier checkpoint"):
+        trainer.save_checkpoint(61)
+    assert not list(trainer.checkpoint_dir.glob("*.ckpt"))
+
+
 @pytest.mark.parametrize(("source", "step"), [("nerfstudio_models", 119), ("a.ply", 119), ("step-000029999.ckpt", 30)])
 def test_warm_start(tiny, trainer_of, tmp_path, source, step):
     params = {name: value for name, value in gaussians(load(tiny.checkpoint(step))).items() if name in SPLAT_NAMES}
@@ -283,7 +291,6 @@ def test_a_run_by_recorded_steps_is_the_same_also_if_they_fail(trainer_of, steps
         trainer.train()
         fields = (trainer.model.gauss_params[name].detach() for name in ("means", "scales", "opacities", "features_dc"))
         quartiles.append(torch.cat([field.quantile(shares) for field in fields]))
-    print((quartiles[0] - quartiles[1]).abs().max())
     torch.testing.assert_close(*quartiles, rtol=0, atol=0.001)
     assert (trainer._recorded is None) == (steps is Failing)
     told = "without recordings, slower: no memory for a recording" in " ".join(capsys.readouterr().out.split())

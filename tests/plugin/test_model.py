@@ -30,12 +30,16 @@ def test_it_is_a_splatfacto_whose_groups_have_features_and_head(build):
     ("options", "cause"),
     [
         ({"pruning": {"keep_ratio": 0.0}}, "keep_ratio"),
-        ({"head": {"num_features": 0}}, "num-features"),
+        ({"head": {"num_features": 0}}, "head.num-features is 0; set at least 1"),
+        ({"head": {"pixel_unshuffle": 0}}, "head.pixel-unshuffle is 0; set 1, 2 or 4"),
         ({"base_loss_weight": -1.0}, "base-loss-weight is -1.0; give 0 or more"),
         ({"average_share": 1.5}, "average-share is 1.5; give a share"),
         ({"drop_rate": 1.0}, "drop-rate is 1.0; give a share of the Gaussians"),
         ({"prior_after_prune": float("nan")}, "prior-after-prune is nan"),
-        ({"use_bilateral_grid": True}, "no bilateral grid"),
+        ({"use_bilateral_grid": True}, "use-bilateral-grid is True; give False"),
+        ({"use_scale_regularization": True}, "False: only splatfacto has it"),
+        ({"sh_degree": 5}, "sh-degree is 5; give 0 to 4"),
+        ({"ssim_lambda": 1.5}, "ssim-lambda is 1.5; give a share"),
     ],
 )
 def test_options_that_cannot_work(build, options, cause):
