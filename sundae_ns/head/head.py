@@ -71,14 +71,13 @@ class HeadConfig:
 
     def validate(self) -> None:
         """Raise a ConfigError for the first value that is invalid."""
-        if self.num_features < 1:
-            raise ConfigError(
-                f"head.num-features is {self.num_features}; set at least 1, or disable the head with head.mode off"
-            )
-        if self.pixel_unshuffle < 1:
-            raise ConfigError(f"head.pixel-unshuffle is {self.pixel_unshuffle}; set 1, 2 or 4")
-        if self.max_train_pixels < 0:
-            raise ConfigError(f"head.max-train-pixels is {self.max_train_pixels}; set 0 for whole images, or more")
+        for name, least, remedy in (
+            ("num_features", 1, "set at least 1, or disable the head with head.mode off"),
+            ("pixel_unshuffle", 1, "set 1, 2 or 4"),
+            ("max_train_pixels", 0, "set 0 for whole images, or more"),
+        ):
+            if (value := getattr(self, name)) < least:
+                raise ConfigError(f"head.{name.replace('_', '-')} is {value}; {remedy}")
 
 
 class CompensationHead(nn.Module):
@@ -226,7 +225,5 @@ def bytes_of_module(module: nn.Module | None) -> int:
 
 def stored_bytes(params: Mapping[str, Tensor], head: HeadConfig | None) -> int:
     """Bytes of Gaussians and their head, whose weights are not allocated; the one count that decides in training."""
-    if head is None or head.mode == "off":
-        return bytes_of(params)
     with torch.device("meta"):
-        return bytes_of(params) + bytes_of_module(CompensationHead(head))
+        return bytes_of(params) + (0 if head is None else bytes_of_module(CompensationHead(head)))

@@ -48,9 +48,7 @@ class UNet(nn.Module):
         zero_init: bool = False,
     ) -> None:
         super().__init__()
-        widths = [width * 2**level for level in range(LEVELS)]
-        if max_width is not None:
-            widths = [min(channels, max_width) for channels in widths]
+        widths = [min(width * 2**level, max_width or width * 2**level) for level in range(LEVELS)]
         fold = pixel_unshuffle**2
         self.pixel_unshuffle = pixel_unshuffle
         inputs = [in_channels * fold, *widths[:-1]]

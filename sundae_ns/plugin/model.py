@@ -259,11 +259,14 @@ class SundaeModel(SplatfactoModel):
         """All training views of a datamanager, and the pixels of each that count; None for all."""
         return [(self.camera_of(camera), mask) for camera, mask in datamanager.training_views()]
 
-    def contribution(self, datamanager: SundaeDatamanager, count: int | None = None) -> Tensor:
-        """Summed blending weight of each Gaussian ``[N]``; see :func:`sundae_ns.scene.render.contribution`."""
-        cameras = self.training_views(datamanager)
-        settings = self.render_settings(training=False)
-        return contribution(self.source, cameras, self.background_color, settings, count, console=CONSOLE)
+    def contribution(self, datamanager: SundaeDatamanager, count: int | None = None, most: int | None = None) -> Tensor:
+        """Summed blending weight of each Gaussian ``[N]`` over all training views, or over ``most`` of them, evenly.
+
+        ``count`` and errors are those of :func:`sundae_ns.scene.render.contribution`.
+        """
+        views, settings = self.training_views(datamanager), self.render_settings(training=False)
+        every = -(-len(views) // (most or len(views)))
+        return contribution(self.source, views[::every], self.background_color, settings, count, console=CONSOLE)
 
     def count_curve(self) -> list[CurvePoint]:
         """The curve by which trials have chosen the number of Gaussians; empty without them."""
@@ -402,6 +405,10 @@ class NerfstudioRun:
     def training_views(self) -> list[tuple[Camera, Tensor | None]]:
         """All training views."""
         return self.model.training_views(self._datamanager)
+
+    def contribution(self, count: int | None, most: int | None = None) -> Tensor:
+        """As :meth:`SundaeModel.contribution`, by the views of this run."""
+        return self.model.contribution(self._datamanager, count, most)
 
     def hold_out(self, indices: Iterable[int]) -> None:
         """Hold out these training views from the next step on, until the next call."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -233,16 +233,8 @@ class Search:
     """
 
     def __init__(self, scene: PackedScene, fit: PackConfig | Codecs, judge: Callable[[], Judge]) -> None:
-        self.scene, self._fit, self._judge = scene, fit, judge
-
-    @cached_property
-    def default(self) -> Candidate:
-        """The pack at the factor 1; of a fine-tuned scene, the one that was trained."""
-        return self.at(0.0)
-
-    def at(self, power: float) -> Candidate:
-        """The pack at a factor of 2^power."""
-        return pack_at(self.scene, self._fit, power)
+        self._at, self._judge = partial(pack_at, scene, fit), judge
+        self.default = self._at(0.0)  # The pack at the factor 1; of a fine-tuned scene, the one that was trained
 
     def drop(self, candidate: Candidate) -> float:
         """PSNR of a pack below the run's on some test views, dB; infinite for images that are not finite."""
@@ -254,13 +246,13 @@ class Search:
         """The coarsest pack that loses at most ``limit`` dB, no larger than that at the factor 1 if this one fits."""
         first, last, best = 0.0, COARSEST, self.default
         if self.drop(best) > limit:
-            first, last, best = FINEST, 0.0, self.at(FINEST)
+            first, last, best = FINEST, 0.0, self._at(FINEST)
             if (drop := self.drop(best)) > limit:
                 loss = f"the finest pack loses {drop:.3f} dB at {best.bytes:,} bytes"
                 raise ConfigError(f"{loss}; give a larger --target-drop")
         for _ in range(7):
             middle = (first + last) / 2
-            candidate = self.at(middle)
+            candidate = self._at(middle)
             if self.drop(candidate) <= limit:
                 first, best = middle, candidate
             else:

@@ -25,7 +25,6 @@ from sundae_ns.io.run_folder import PRUNES, prunes_before
 from sundae_ns.pruning.decision import Pruner
 from sundae_ns.pruning.floaters import MOST, near_cameras
 from sundae_ns.pruning.rule import PruneRule, ScoreName, kept_count
-from sundae_ns.scene.render import contribution
 from sundae_ns.train.schedules import notify_pruned
 from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
@@ -244,13 +243,8 @@ class ScheduledPruning(Callback):
         if due:
             _log.info(f"step {state.step}: pruning {run.source.total:,} Gaussians, with passes over the training views")
         before = run.evaluate() if due and self.evaluate else {}
-
-        def contribute(count: int | None) -> Tensor:
-            return contribution(run.source, run.training_views(), run.background, run.settings, count)
-
         try:
-            pruner = Pruner(state.gaussians, state.optimizers, [state.densification])
-            report = prune_when_due(config, pruner, state.pruning, state.schedule_step, contribute)
+            report = prune_when_due(config, state.pruner, state.pruning, state.schedule_step, run.contribution)
         except SundaeError:
             # Do not lose the warm-up to an option that can be corrected: a resumed run prunes at its first step.
             run.save()
@@ -344,6 +338,5 @@ class FloaterRemoval(Callback):
             return
         self._points = None
         eyes = torch.stack([camera.center for camera, _ in run.training_views()])
-        pruner = Pruner(state.gaussians, state.optimizers, [state.densification])
-        if removed := pruner.drop(near_cameras(pruner.params["means"], eyes, points), at_most=MOST):
+        if removed := state.pruner.drop(near_cameras(state.gaussians["means"], eyes, points), at_most=MOST):
             _log.info(f"step {state.step}: removed {removed:,} floaters right in front of a camera")

@@ -19,6 +19,7 @@ from sundae_ns.core.camera import Camera
 from sundae_ns.core.gaussians import FEATURES, MAX_SH_DEGREE, Gaussians
 from sundae_ns.core.surgery import Snapshot, module_snapshot, restore, restore_module, snapshot
 from sundae_ns.head.head import CompensationHead
+from sundae_ns.pruning.decision import Pruner
 from sundae_ns.rasterize.types import Backend
 from sundae_ns.scene.render import RenderSettings
 
@@ -64,6 +65,11 @@ class TrainingState:
     def device(self) -> torch.device:
         """Device of the field."""
         return self.gaussians["means"].device
+
+    @property
+    def pruner(self) -> Pruner:
+        """Prunes the field together with its optimizers and the running state of densification."""
+        return Pruner(self.gaussians, self.optimizers, [self.densification])
 
     @property
     def densifying(self) -> bool:

@@ -27,6 +27,7 @@ import logging
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
@@ -39,9 +40,8 @@ from sundae_ns.core.surgery import replace_parameter
 from sundae_ns.head.head import stored_bytes
 from sundae_ns.io.coordinates import scene_order
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
-from sundae_ns.pruning.decision import Pruner
 from sundae_ns.pruning.rule import kept_count
-from sundae_ns.scene.render import contribution, render_view
+from sundae_ns.scene.render import render_view
 from sundae_ns.scene.scene import initial_features
 from sundae_ns.train import choice
 from sundae_ns.train.averaging import AVERAGED_EVERY, RunningMean, weights_of
@@ -168,6 +168,7 @@ class Trials(Callback):
 
     def __init__(self, options: Any, state: TrainingState, densification: Densification, begins_at: float) -> None:
         self.config, self.ssim_weight = options.pruning, options.ssim_lambda
+        self._tolerance = Tolerance.of_drop(self.config.max_drop)
         self.begins_at = begins_at
         self.decides_head = options.head.mode == "auto"
         self.progress = Progress()
@@ -433,13 +434,9 @@ class Trials(Callback):
         curve, tenth = choice.curve_of(self.progress.of("count")), self.progress.of("tenth")
         return choice.with_head(curve, HeadGain.of(*tenth)) if self.progress.chosen.get("tenth") else curve
 
-    @property
-    def _tolerance(self) -> Tolerance:
-        return Tolerance.of_drop(self.config.max_drop)
-
     def _begin_counts(self, run: TrainingRun) -> None:
         state = run.state
-        Pruner(state.gaussians, state.optimizers, [state.densification]).drop_nonfinite()
+        state.pruner.drop_nonfinite()
         self._densification.initialize(state)  # its statistics would not match the Gaussians that come back
         self.progress.full = run.source.total
         self._announce(run, "how many Gaussians does the scene need?", len(SHARES), self._window, self._judges)
@@ -475,15 +472,8 @@ class Trials(Callback):
 
     def _prune(self, run: TrainingRun, count: int) -> None:
         """Prune as the schedule would, by fewer views."""
-        state = run.state
-
-        def contribute(kept: int | None) -> Tensor:
-            views = run.training_views()
-            views = views[:: -(-len(views) // MOST_CONTRIBUTING)]
-            return contribution(run.source, views, run.background, run.settings, kept)
-
-        pruner = Pruner(state.gaussians, state.optimizers, [state.densification])
-        prune_to(lambda n: min(count, n), self.config, pruner, state.pruning, state.schedule_step, contribute)
+        state, contribute = run.state, partial(run.contribution, most=MOST_CONTRIBUTING)
+        prune_to(lambda n: min(count, n), self.config, state.pruner, state.pruning, state.schedule_step, contribute)
 
     def _count_of(self, curve: list[CurvePoint]) -> tuple[int, str]:
         limits = {"most": self.config.max_gaussians, "most_bytes": self.config.max_bytes}

@@ -222,12 +222,10 @@ def test_a_fine_tune_that_does_not_help_is_left_out(scene, tuned, drop, helps):
             best_pack([other, plain], 0.0001)
 
 
-def test_coarser_steps_that_take_more_bytes_are_not_taken(tuned):
-    class Growing(Search):
-        def at(self, power):
-            return Candidate(self.scene, tuned.codecs, round(100 + 10 * power))
-
-    assert Growing(tuned.scene, tuned.codecs, lambda: Stated(lambda _: 0.0)).better_than(0.1).bytes == 100
+def test_coarser_steps_that_take_more_bytes_are_not_taken(tuned, monkeypatch):
+    growing = lambda scene, codecs, power: Candidate(scene, codecs, round(100 + 10 * power))  # noqa: E731
+    monkeypatch.setattr(tuned_packs, "pack_at", growing)
+    assert search_tuned(tuned, lambda _: 0.0).better_than(0.1).bytes == 100
 
 
 def test_targets_that_cannot_be_met(tiny, scene, tmp_path, capsys):

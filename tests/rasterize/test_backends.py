@@ -85,7 +85,6 @@ def deviation(ours, exact):
 def compare(ours, exact, values, gradients):
     assert ours.keys() == exact.keys()
     errors = {name: deviation(ours[name], exact[name]) for name in exact if name != "radii"}
-    print({name: f"{error:.1e}" for name, error in errors.items()})
     for name, error in errors.items():
         assert torch.isfinite(ours[name]).all(), name
         assert error <= (values if name in ("image", "alpha", "depth") else gradients), (name, error)

@@ -17,6 +17,8 @@ def point(count, psnr_loss=0.0, ssim_loss=0.0, size=None):
 
 
 def test_views_count_by_their_pixels():
+    mean = choice.mean_quality([HeldOutQuality(300, 20.0, 0.5), HeldOutQuality(100, 40.0, 0.9)])
+    assert mean == (25.0, pytest.approx(0.6))
     rows = [Tried("count", 100, "plain", 9, [[1e-9, 0, 0.9, few], [100, 0, 0.9, 30.0]]) for few in (30.0, 20.0)]
     assert choice.curve_of(rows)[1].psnr_loss == pytest.approx(0, abs=1e-6)
     # A gain of 1 dB on few pixels does not outweigh a loss on many.
@@ -148,6 +150,7 @@ def test_all_pixels_count_or_those_under_the_mask(pair):
     bare = view_quality(*pair, None)
     assert bare[:3] == (24 * 32, pytest.approx(float(psnr(*pair))), pytest.approx(float(ssim(*pair))))
     mask = torch.zeros(24, 32, dtype=torch.bool)
+    assert view_quality(*pair, mask).pixels == 0
     mask[:, :16] = True
     found = view_quality(torch.where(mask[..., None], image, torch.full_like(image, math.nan)), target, mask)
     error = (image - target)[:, :16].square().mean()
@@ -157,12 +160,6 @@ def test_all_pixels_count_or_those_under_the_mask(pair):
     whole = float(ssim(torch.where(mask[..., None], image, target), target))
     half = float(ssim(image[:, :16], target[:, :16]))
     assert abs(found.ssim - half) < 0.3 * abs(whole - half)
-
-
-def test_views_count_by_their_pixels_and_a_masked_view_not_at_all(pair):
-    assert view_quality(*pair, torch.zeros(24, 32, dtype=torch.bool)).pixels == 0
-    mean = choice.mean_quality([HeldOutQuality(300, 20.0, 0.5), HeldOutQuality(100, 40.0, 0.9)])
-    assert mean == (25.0, pytest.approx(0.6))
 
 
 def test_an_exact_image_and_a_small_one_are_finite_and_a_broken_one_is_not(pair):

@@ -102,6 +102,8 @@ def test_continuous_ends_at_exactly_the_target(last):
         assert all(optimizers[name].param_groups[0]["params"] == [params[name]] for name in optimizers)
         assert {len(value) for value in densification.values() if isinstance(value, Tensor)} <= {80}
     assert state["peak"] == 100
+    with pytest.raises(DataError, match="no Gaussian is left"):  # none to add others to
+        prune_when_due(config, Pruner(*gaussians(0)), state, 4, lambda _: torch.ones(0))
 
 
 def test_continuous_draws_anew_each_time():
@@ -129,12 +131,6 @@ def test_broken_gaussians_are_dropped_before_the_contribution_and_counted():
     assert asked == [(49, 98)]
     assert (report["before"], report["dropped_nonfinite"], report["after"]) == (100, 2, 49)
     assert all(value.isfinite().all() for value in params.values())
-
-
-def test_off_never_prunes_but_counts():
-    reports, state = run(PruningConfig(mode="off", prune_at=0, start=0, every=1), gaussians(), range(4))
-    assert reports == []
-    assert state == {"pruned_at": -1, "num_prunes": 0, "peak": 100}
 
 
 @pytest.mark.parametrize(
@@ -170,7 +166,8 @@ def test_a_report_says_in_one_line_what_happened_and_leaves_out_what_did_not():
     assert summary(odd).endswith("2,000,000; sigma 0.0316, tau 0.009, 1,500 isolated")
 
 
-def test_continuous_prunes_a_step_once_and_above_the_cap_also_afterwards():
+def test_continuous_prunes_a_step_once_and_above_the_cap_also_afterwards_and_off_never():
+    assert run(PruningConfig(mode="off", prune_at=0, start=0), gaussians(), range(4)) == ([], {**UNPRUNED, "peak": 100})
     config = PruningConfig(mode="continuous", start=0, stop=10, every=20, max_gaussians=100)
     assert [config.due(UNPRUNED, step, 101) for step in (9, 10, 30)] == [False, True, True]
     assert not config.due(UNPRUNED, 30, 100)
