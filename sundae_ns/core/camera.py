@@ -13,11 +13,12 @@ import torch
 from torch import Tensor
 
 from sundae_ns.core.errors import ConfigError
-from sundae_ns.core.values import AnyArray, numbers, whole
+from sundae_ns.core.values import AnyArray, numbers, usual_defaults, whole
 
 OPENGL_TO_OPENCV = (1.0, -1.0, -1.0)  # sign of each camera axis
 
 
+@usual_defaults()
 def world_to_camera(pose: Tensor) -> Tensor:
     """World-to-camera ``[..., 4, 4]``, OpenCV axes, of camera-to-world ``[..., 3, 4]``, OpenGL axes; differentiable."""
     rotation = pose[..., :3] * pose.new_tensor(OPENGL_TO_OPENCV)
@@ -123,6 +124,7 @@ class Camera(NamedTuple):
         return cls.from_fov(poses_looking_at(center, point, above / above.norm()), fov, width, height)
 
     @property
+    @usual_defaults()
     def center(self) -> Tensor:
         """Camera centre, world units ``[3]``."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]

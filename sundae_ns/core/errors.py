@@ -71,16 +71,14 @@ def writing(failure: str) -> Iterator[None]:
     """Turn file-system errors that a user can correct into ``StorageError``, whose message starts with ``failure``."""
     try:
         yield
-    except SundaeError:
-        raise
     except Exception as error:
         cause: BaseException | None = error
         # torch and zipfile replace a failed write by an error of their own when they close the file.
-        while cause is not None and not isinstance(cause, OSError):
+        while cause is not None and not isinstance(cause, (OSError, SundaeError)):
             cause = cause.__cause__ or cause.__context__
-        if cause is None or cause.errno not in _REASONS:
+        if (number := getattr(cause, "errno", None)) not in _REASONS:
             raise
-        raise StorageError(f"{failure}: {_REASONS[cause.errno]}") from error
+        raise StorageError(f"{failure}: {_REASONS[number]}") from error
 
 
 @contextmanager

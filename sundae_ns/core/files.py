@@ -35,10 +35,10 @@ def replacing(path: Path, partial: Path | None = None) -> Iterator[Path]:
 
     After a kill or a power cut, ``path`` is either the earlier file or the complete new one. If the block raises, its
     file is removed and ``path`` is unchanged. A missing folder is made. ``partial`` is the temporary file; by default
-    one named after this process, and those of killed processes are removed. ``StorageError`` if nothing can be written.
+    one of a random number, and those of killed processes are removed. ``StorageError`` if nothing can be written.
     """
     owned = partial is None and not _WINDOWS
-    partial = partial or path.with_name(f"{path.name}.{os.getpid()}{PARTIAL}")
+    partial = partial or path.with_name(f"{path.name}.{int.from_bytes(os.urandom(4))}{PARTIAL}")
     try:
         with writing(f"cannot write {path}"), ExitStack() as stack:
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -111,8 +111,7 @@ def snapshot(params: Mapping[str, Tensor], optimizers: Optimizers) -> Snapshot:
     saved = {}
     for name, value in params.items():
         entries = {"value": value, **(optimizers[name].state.get(value, {}) if name in optimizers else {})}
-        tensors = {key: entry for key, entry in entries.items() if isinstance(entry, Tensor)}
-        saved[name] = {key: tensor.detach().cpu().clone() for key, tensor in tensors.items()}
+        saved[name] = {key: entry.detach().cpu().clone() for key, entry in entries.items() if isinstance(entry, Tensor)}
     return saved
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import numpy as np
@@ -72,17 +72,17 @@ def positions(values: Any, name: str) -> Tensor:
 
 @contextmanager
 def usual_defaults() -> Iterator[None]:
-    """Make new tensors float32 on the CPU, for autograd too, in a block or a function, whatever a caller has set."""
+    """Compute in float32, with new tensors on the CPU and for autograd, in a block, whatever a caller has set."""
     given = torch.empty(0)
-    if given.dtype is torch.float32 and given.device.type == "cpu" and not given.is_inference():
+    with ExitStack() as stack:
+        for kind in filter(torch.is_autocast_enabled, ("cpu", "cuda")):
+            stack.enter_context(torch.autocast(kind, enabled=False))
+        if given.dtype is not torch.float32 or given.device.type != "cpu" or given.is_inference():
+            stack.callback(torch.set_default_dtype, given.dtype)
+            torch.set_default_dtype(torch.float32)
+            stack.enter_context(torch.device("cpu"))
+            stack.enter_context(torch.inference_mode(False))
         yield
-        return
-    torch.set_default_dtype(torch.float32)
-    try:
-        with torch.device("cpu"), torch.inference_mode(False):
-            yield
-    finally:
-        torch.set_default_dtype(given.dtype)
 
 
 @contextmanager

@@ -202,10 +202,13 @@ def test_what_is_refused_in_one_line(name):
 
 
 @pytest.mark.usefixtures("short_prunes")
-def test_inference_mode_is_that_of_the_caller():
-    with torch.inference_mode():
+def test_modes_of_the_caller_stay_and_change_no_value():
+    image = sn.render(SCENE, CAMERA).rgb
+    with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16):
         assert sn.prune(sn.Scene.from_points(POINTS, POINTS), count=50, cameras=CAMERA).num_gaussians == 50
-        assert torch.ones(1).is_inference()
+        assert torch.equal(sn.render(SCENE, look_at((2, 2, 2), (0.5, 0.5, 0.5), width=24, height=20)).rgb, image)
+        torch.testing.assert_close(CAMERA.center, torch.full((3,), 2.0))
+        assert (torch.ones(1).is_inference(), torch.is_autocast_enabled("cpu")) == (True, True)
 
 
 def test_the_rule_of_a_prune_is_that_of_the_command():
