@@ -175,6 +175,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             _log.warning(f"{folder / masks} is not used; to leave out what its masks hide, give {how}")
         if is_colmap and (larger := larger_model(folder, parser.colmap_path)) is not None:
             _log.warning(larger)
+        outputs.metadata.setdefault("points3D_rgb", torch.empty(0, 3))  # without colours, a cloud is grey
         transform = outputs.dataparser_transform.clone()
         # nerfstudio states the translation after the scale that a capture has been given.
         transform[:, 3] /= getattr(self.dataparser, "applied_scale", 1.0)
@@ -211,10 +212,9 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
 
     def training_views(self) -> Iterator[tuple[Cameras, Tensor | None]]:
         """All training views: camera of shape ``(1,)`` on the CPU, and the mask, if any, bool ``[H, W, 1]``."""
-        outputs = self.train_dataparser_outputs
+        outputs, lenses = self.train_dataparser_outputs, self.train_dataset.lenses
         # Undistortion masks what a fisheye lens has not seen.
-        round_lens = (outputs.cameras.camera_type != CameraType.PERSPECTIVE.value).any()
-        masked = outputs.mask_filenames is not None or bool(round_lens)
+        masked = outputs.mask_filenames is not None or bool((lenses != CameraType.PERSPECTIVE.value).any())
         for index in self.train_indices:
             # Read the mask first: undistortion changes the camera.
             mask = self.cached_train[index].get("mask") if masked else None
@@ -287,26 +287,24 @@ def undistorting(paths: Sequence[Path]) -> Callable[..., Result]:
         intrinsics = K.copy()
         mask = data.get("mask")
         kind = int(camera.camera_type)
-        result = None
         cause = "has a distortion that leaves no image"
         if kind == CameraType.PERSPECTIVE.value and distortion_params[3]:
-            result = _of_brown(intrinsics, distortion_params, image, mask)
+            if (filled := _of_brown(intrinsics, distortion_params, image, mask)) is not None:
+                return filled
         else:
             try:
-                stock = full_images_datamanager._undistort_image(camera, distortion_params, data, image, K)
+                stock: Result = full_images_datamanager._undistort_image(camera, distortion_params, data, image, K)
                 ratio = float(stock[0][0, 0]) / max(stock[1].shape[1], 1)
                 # A view of more than 157 degrees (a ratio of 0.1) shows a smear.
                 if np.isfinite(stock[0]).all() and 0.1 <= ratio <= 1000 and (stock[1].any() or not image.any()):
-                    result = stock
-                elif kind == CameraType.FISHEYE.value and _is_lens(distortion_params, intrinsics, image):
-                    result = _middle(intrinsics, distortion_params, image, mask)
+                    return stock
+                if kind == CameraType.FISHEYE.value and _is_lens(distortion_params, intrinsics, image):
+                    return _middle(intrinsics, distortion_params, image, mask)
             except (AssertionError, LookupError, TypeError, ValueError, cv2.error) as error:
                 cause = f"cannot be undistorted ({one_line(error)})"
-        if result is None:
-            values = ", ".join(f"{float(value):.3g}" for value in distortion_params)
-            what = f"{paths[int(data['image_idx'])].name} {cause}; check its k1 ... p2 ({values})"
-            raise DataError(f"{what}, which are of coordinates in focal lengths, not in pixels")
-        return result
+        values = ", ".join(f"{float(value):.3g}" for value in distortion_params)
+        what = f"{paths[int(data['image_idx'])].name} {cause}; check its k1 ... p2 ({values})"
+        raise DataError(f"{what}, which are of coordinates in focal lengths, not in pixels")
 
     return undistort
 

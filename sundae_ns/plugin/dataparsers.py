@@ -376,7 +376,7 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
     if (aside.amin(dim=1) > 0.24).all():
         what = "cx and cy lie far from the middle of all images"
         _log.warning(f"{what}; if they are of images of another size, scale them")
-    if points is not None:
+    if points is not None and len(points):
         warn_of_cloud(points, cameras)
     centres = cameras.camera_to_worlds[:, :, 3]
     middle = centres.median(dim=0).values
@@ -411,7 +411,9 @@ def check_tests(train: Any, test: Any) -> None:
 
 
 def check_projection(camera: Cameras) -> None:
-    """Raise ``DataError`` for a camera that asks for another projection, as a camera path may; ours are perspective."""
+    """Raise ``DataError`` for rays, and for a camera of another projection, as a camera path may ask for."""
+    if not isinstance(camera, Cameras):
+        raise DataError("Gaussians are not seen by rays; use ns-export gaussian-splat, or sundae export RUN -o a.ply")
     if (kind := CameraType(int(camera.camera_type.flatten()[0]))) != CameraType.PERSPECTIVE:
         what = f"the camera is of type {kind.name.lower()}, and only perspective images can be drawn"
         raise DataError(f"{what}; set camera_type to perspective, for a panorama render the six faces of a cube")

@@ -214,8 +214,6 @@ class SundaeModel(SplatfactoModel):
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> MutableMapping[str, Any]:  # type: ignore[override]
         """Render a camera, or the Gaussians in a box; unlike splatfacto's, this leaves the camera on its device."""
-        if not in_viewer():  # an error would end the viewer
-            check_projection(camera)
         self.set_crop(obb_box)
         return self.get_outputs(camera)
 
@@ -239,6 +237,8 @@ class SundaeModel(SplatfactoModel):
         return {**images, "background": background, "window": crop}
 
     def _shown_outputs(self, ns_camera: Cameras) -> MutableMapping[str, Any]:
+        if not in_viewer():  # an error would end the viewer
+            check_projection(ns_camera)
         background, camera = self._get_background_color(), self.camera_of(ns_camera)
         crop = None if self.crop_box is None else self.crop_box.within(self.means).squeeze(-1)
         visible = self.viewer_controls.visible(self.source, crop, compensate=self.compensated)

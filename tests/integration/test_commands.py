@@ -2,7 +2,6 @@
 
 import importlib
 import json
-import math
 import shutil
 from pathlib import Path
 
@@ -82,11 +81,9 @@ def test_ns_render_interpolate(render):
 def test_ns_render_camera_path(render, tmp_path):
     """Of two poses; other projections are refused."""
     path = tmp_path / "path.json"
-    pose = torch.eye(4)
-    pose[2, 3] = 1.0
-    turned = pose.clone()
-    turned[:2, :2] = torch.tensor([[math.cos(0.3), -math.sin(0.3)], [math.sin(0.3), math.cos(0.3)]])
-    poses = [{"camera_to_world": m.flatten().tolist(), "fov": 70, "aspect": 1} for m in (pose, turned)]
+    places = torch.eye(4).repeat(2, 1, 1)
+    places[:, 2, 3] = torch.tensor([1.0, 1.5])
+    poses = [{"camera_to_world": m.flatten().tolist(), "fov": 70, "aspect": 1} for m in places]
     stated = {"camera_path": poses, "render_height": 31, "render_width": 45, "seconds": 1}
     path.write_text(json.dumps({**stated, "camera_type": "fisheye"}))
     with pytest.raises(DataError, match="only perspective images can be drawn; set camera_type to perspective"):
@@ -107,8 +104,9 @@ def test_ns_export(tiny, call_here, tmp_path):
     assert ply_marks(tmp_path / "splat.ply").in_model_frame
     found = read_ply(tmp_path / "splat.ply")
     state = torch.load(tiny.checkpoint(tiny.steps - 1), map_location="cpu")["pipeline"]
-    for name in SPLAT_NAMES:
-        assert torch.equal(found[name], state[f"_model.gauss_params.{name}"]), name
+    assert all(torch.equal(found[name], state[f"_model.gauss_params.{name}"]) for name in SPLAT_NAMES)
+    with pytest.raises(DataError, match="not seen by rays; use ns-export gaussian-splat"):
+        call_here("ns-export", "pointcloud", "--load-config", tiny.config, "--output-dir", tmp_path)
 
 
 @pytest.fixture(scope="module")

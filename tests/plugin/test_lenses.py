@@ -82,7 +82,6 @@ def test_cameras_of_a_path_with_other_projections_are_refused(kind):
     camera = Cameras(torch.eye(4)[None, :3], 20.0, 20.0, 10.0, 8.0, 20, 16, camera_type=kind)
     with pytest.raises(DataError, match=f"of type {kind.name.lower()}, and only perspective images"):
         check_projection(camera)
-    check_projection(Cameras(torch.eye(4)[None, :3], 20.0, 20.0, 10.0, 8.0, 20, 16))
 
 
 def undistorted(path, distortion):
