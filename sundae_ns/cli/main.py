@@ -75,7 +75,7 @@ def _dispatch(words: Sequence[str]) -> int:
 
     if (flag := "--remove-floaters") in options:  # its number may be left out
         at = options.index(flag) + 1
-        options[at:at] = [] if re.fullmatch(r"-?[\d.]+", "".join(options[at : at + 1])) else ["0.25"]
+        options[at:at] = [] if re.fullmatch(r"-?[\d.]+(e-?\d+|%)?", "".join(options[at : at + 1])) else ["0.25"]
     # Only the module of this command: some import torch, which takes a second.
     run = getattr(importlib.import_module(f"sundae_ns.cli.{name}"), name)
     messages, later = io.StringIO(), wraps(run)(lambda *given, **named: partial(run, *given, **named))

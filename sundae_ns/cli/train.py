@@ -60,6 +60,8 @@ class TrainOptions(Wishes):
             "--pipeline.model.pruning.max-bytes": most or None if self.method == "sundae" else None,
             "--pipeline.model.head.mode": "off" if self.advanced.no_head else None,
             "--machine.seed": self.advanced.seed,
+            "--pipeline.datamanager.train-cameras-sampling-seed": self.advanced.seed,
+            "--pipeline.model.pruning.seed": self.advanced.seed,
             "--max-num-iterations": self.steps,
         }
         if tunes and not any(_value_of(option, more) for option in LENGTHS):

@@ -58,7 +58,7 @@ REFUSALS = {
     "pack in.ply -o a.sundae --finetune 9": "in.ply is a .ply file without photos; leave out",
     "pack in.ply -o a.sundae --start-view 0": "there is no camera 0 in the scene; give a camera file",
     "pack in.ply -o a.sundae --target-drop 1": "leave out --target-drop, or give a run",
-    "prune gone -o a.ply --remove-floaters 1.5": "remove-floaters is 1.5; give 0 (careful) to 1",
+    "prune gone -o a.ply --remove-floaters 15e-1": "remove-floaters is 1.5; give 0 (careful) to 1",
     "pack in.ply -o a.sundae --finetune 5 --crop 0 0 0 1 1 1": "leave out --crop",
     "pack in.ply -o a.spz": "a.spz is a name of another format; name it .sundae, or write it with sundae export",
     "pack gone -o a.sundae": "gone does not exist",

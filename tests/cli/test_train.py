@@ -22,12 +22,13 @@ def train(*words):
 
 @pytest.mark.parametrize("method", sorted(entry_points(module="sundae_ns.method_configs").names))
 def test_the_printed_command_runs(commands, capsys, method):
-    assert train("scene", "-o", "my runs", "--method", method, "--steps", "700", "--keep", "0.05") == 0
+    assert train("scene", "-o", "my runs", "--method", method, "--steps", "700", "--keep", "0.05", "--seed", "7") == 0
     assert shlex.split(capsys.readouterr().out.splitlines()[0]) == commands.ran[0]
     assert commands.ran[0][:2] == ["ns-train", method]
     config = config_of(commands.ran[0], method)
     assert (config.data, config.output_dir, config.max_num_iterations) == (Path("scene"), Path("my runs"), 700)
-    assert config.pipeline.model.pruning.keep_ratio == 0.05
+    pruning, seeds = config.pipeline.model.pruning, config.pipeline.datamanager.train_cameras_sampling_seed
+    assert (pruning.keep_ratio, pruning.seed, seeds, config.machine.seed) == (0.05, 7, 7, 7)
     assert train("scene", "--method", method, "--max-mb", "2") == 0
     most = "--pipeline.model.pruning.max-bytes" in commands.ran[2], commands.ran[-1][-2:]
     assert most == (method == "sundae", ["--max-mb", "2.0"]), "without trials the pack alone has this size"
