@@ -78,8 +78,9 @@ def threads() -> int:
 
 def find_poses(request: Request, report: Reporter, warn: Warn = print) -> Placed:
     """Make a capture; continue what an earlier process has begun with the same photos and options."""
-    work, video = request.work, is_video(request.photos)
-    images, frames, made = work / "images", work / "frames", work / "capture"
+    video = is_video(request.photos)
+    work = request.work
+    images, frames, made = (work / name for name in ("images", "frames", "capture"))
 
     def stage(name: str, parts: int, function: Callable[..., Any], *words: Any) -> Any:
         with report(name, parts) as advance:
@@ -105,9 +106,10 @@ def find_poses(request: Request, report: Reporter, warn: Warn = print) -> Placed
         flush(made / TRANSFORMS)  # written last; the system has written the other files meanwhile
         made.replace(request.capture)
         shutil.rmtree(work, ignore_errors=True)
-    cameras, counts = len({Path(name).parent for name in _posed(models[0])}), [len(_posed(model)) for model in models]
+    cameras = {Path(name).parent for name in _posed(models[0])}  # each has a folder of its own
     error = float(models[0].compute_mean_reprojection_error())
-    return placed_in(request.capture)._replace(cameras=cameras, error=error, models=tuple(counts))
+    counts = tuple(len(_posed(model)) for model in models)
+    return placed_in(request.capture)._replace(cameras=len(cameras), error=error, models=counts)
 
 
 def _keep_or_clear(request: Request, files: Sequence[Path]) -> None:

@@ -407,7 +407,8 @@ def fit_codecs(
     codecs: dict[str, Rotations | Transform] = {"quats": Rotations(config.rotation_step)}
     for name, option in _STEPS.items():
         if name != "quats" and name in values and values[name].size:
-            form, step = sensitivity.rows.get(name), getattr(config, option)
+            step = getattr(config, option)
+            form = sensitivity.rows.get(name)
             codecs[name] = fit_transform(values[name], step, centred=name != "features_rest", form=form)
     ordered = {name: torch.from_numpy(values[name]).reshape(gaussians[name].shape) for name in values}
     return ordered, Codecs(config, blocks, codecs, _fit_head(head, config.head_step, sensitivity.head))
