@@ -41,6 +41,8 @@ from sundae_ns.scene.render import GaussianSource, RenderSettings, colors_from, 
 from sundae_ns.train.densification import COUNTED, STATISTICS, count_view, start_counting
 from sundae_ns.train.state import HEAD, Callback, TrainingState
 
+AGREED_EVERY = 16  # Batches from one question whether to stop to the next, as each waits for the GPU
+
 
 def check_options(config: Any) -> None:
     """Raise ``ConfigError`` for the first option of a ``SundaeTrainerConfig`` that several ranks cannot use."""
@@ -208,10 +210,10 @@ class Ranks:
         self._scatter()
 
     def agreed(self, number: int, batch: int) -> int:
-        """The signal after which all ranks stop with this batch; 0 for none. Collective at every 16th batch."""
+        """The signal after which all ranks stop with this batch; 0 for none. Collective where ranks ask."""
         if self.count == 1:
             return number
-        if batch % 16:  # asking waits for the GPU
+        if batch % AGREED_EVERY:
             return 0
         return int(_summed(torch.tensor(number, device=self._model.device), dist.ReduceOp.MAX))
 

@@ -40,7 +40,6 @@ from sundae_ns.rasterize.types import Backend
 from sundae_ns.scene.frames import FrameReplay, LazyOutputs, ShownResponse, empty_outputs, late_outputs
 from sundae_ns.scene.render import SHOWN_BACKGROUNDS, GaussianSource, RenderSettings, contribution, render_view
 from sundae_ns.train.build import build
-from sundae_ns.train.curve import CurvePoint
 from sundae_ns.train.exposure import ExposureCompensation
 from sundae_ns.train.initialize import Start
 from sundae_ns.train.pruning import DROPPED, FEW_DROPPED, MANY_VIEWS, PruningConfig
@@ -111,7 +110,8 @@ class SundaeModel(SplatfactoModel):
         self.lpips = Lpips()  # type: ignore[assignment]
         self.crop_box: OrientedBox | None = None
         self.background_color = torch.tensor(SHOWN_BACKGROUNDS[config.background_color])
-        self.viewer_controls = ViewerControls(self.state, config.pruning, self.contribution, self.count_curve)
+        curve = next((callback.curve for callback in self.train_callbacks if isinstance(callback, Trials)), list)
+        self.viewer_controls = ViewerControls(self.state, config.pruning, self.contribution, curve)
         self.compensated = True  # Whether images outside of a viewer get the head's correction
         self._response, self._replay = ShownResponse(), FrameReplay()
         # Views of training cameras that do not move, by index and divisor of their sides
@@ -260,17 +260,10 @@ class SundaeModel(SplatfactoModel):
         return [(self.camera_of(camera), mask) for camera, mask in datamanager.training_views()]
 
     def contribution(self, datamanager: SundaeDatamanager, count: int | None = None, most: int | None = None) -> Tensor:
-        """Summed blending weight of each Gaussian ``[N]`` over all training views, or over ``most`` of them, evenly.
-
-        ``count`` and errors are those of :func:`sundae_ns.scene.render.contribution`.
-        """
+        """Blending weights ``[N]`` by all or ``most`` views, see :func:`sundae_ns.scene.render.contribution`."""
         views, settings = self.training_views(datamanager), self.render_settings(training=False)
         every = -(-len(views) // (most or len(views)))
         return contribution(self.source, views[::every], self.background_color, settings, count, console=CONSOLE)
-
-    def count_curve(self) -> list[CurvePoint]:
-        """The curve by which trials have chosen the number of Gaussians; empty without them."""
-        return [point for cb in self.train_callbacks if isinstance(cb, Trials) for point in cb.curve()]
 
     # ----------------------------------------------------------------------------------------------------- training
 

@@ -41,6 +41,7 @@ from sundae_ns.train.progress import Interruption, loaded_run, long_on_cpu, resu
 from sundae_ns.train.schedules import schedule_table, set_schedule
 
 _log = logging.getLogger(__name__)
+TIMED_STEPS = 10  # After the first two, by which a training on a CPU foretells its length
 
 
 @dataclass
@@ -181,7 +182,11 @@ class SundaeTrainer(Trainer):
             # After a resume the first batch may be a part: harmonics and gains of photos are due at multiples.
             self._batch_ends = step - step % self.ranks.count + self.ranks.count
             if all(callback.trains(model.state) for callback in model.train_callbacks):
-                self._result = self._recorded_iteration(step) or self._iteration(step)
+                self._result = self._recorded_iteration(step)
+                if self._result is None:
+                    loss, terms, metrics = super().train_iteration(step)
+                    # Without a graph, because nerfstudio holds them for a step.
+                    self._result = loss.detach(), {name: term.detach() for name, term in terms.items()}, metrics
                 if self.ranks.count > 1:
                     self.ranks.sharded.count_views(model.state, absgrad=model.config.use_absgrad)
             elif self._result is None:  # the run was resumed while training is paused: measure one image
@@ -194,11 +199,6 @@ class SundaeTrainer(Trainer):
             self._stopped_by = self.ranks.agreed(self._interruption.number, step // self.ranks.count)
             self.stop_training = self.stop_training or bool(self._stopped_by)
         return self._result
-
-    def _iteration(self, step: int) -> Any:
-        """Train one step kernel by kernel; the result has no graph, because nerfstudio holds it for a step."""
-        loss, terms, metrics = super().train_iteration(step)
-        return loss.detach(), {name: term.detach() for name, term in terms.items()}, metrics
 
     def _recordable(self) -> bool:
         """Whether a CUDA graph can hold a training step under these options."""
@@ -240,12 +240,12 @@ class SundaeTrainer(Trainer):
             scheduler.step()
 
     def _warn_if_long(self, number: int) -> None:
-        """On a CPU, warn of a training of hours, by ten steps; the first compiles, and the second warms up."""
+        """On a CPU, warn of a training of hours, by some steps; the first compiles, and the second warms up."""
         if number == 1:
             self._measured_from = time.perf_counter()
-        elif number == 11 and self.config.machine.device_type == "cpu":
-            seconds = (time.perf_counter() - self._measured_from) / 10
-            if (warning := long_on_cpu(seconds, self.last_step - self._start_step - 11)) is not None:
+        elif number == 1 + TIMED_STEPS and self.config.machine.device_type == "cpu":
+            seconds = (time.perf_counter() - self._measured_from) / TIMED_STEPS
+            if (warning := long_on_cpu(seconds, self.last_step - self._start_step - number)) is not None:
                 _log.warning(warning)
 
     def _stop(self) -> None:

@@ -44,6 +44,7 @@ RATES |= {"quats": 2e-4, "features": 5e-4, "head": 2e-4}
 """Peak rates of Adam, about a fifth of the initial rates of a run. Positions are rounded once and fixed: at the end of
 training they hardly move."""
 Tuned = tuple[PackedScene, Codecs]
+JUDGED, BISECTIONS = 8, 7  # Most test views on which a pack is measured, and packs between the limits of a search
 RATE = 0.025  # Loss for each bit per stored number: about what a bit less costs in quality at the steps of FINETUNED
 
 
@@ -182,11 +183,11 @@ class RoundedTraining:
 
 
 class Judge:
-    """Measures a run, and packs of it, on up to eight of its test views; arguments and errors as :func:`load_model`."""
+    """Measures a run, and packs of it, on some of its test views; arguments and errors as :func:`load_model`."""
 
     def __init__(self, run: Path, data: Path | None) -> None:
         opened = load_model(run, data)
-        chosen = spread(len(opened.cameras), 8)
+        chosen = spread(len(opened.cameras), JUDGED)
         self._model = opened.model
         self.cameras, self.all_cameras = len(chosen), len(opened.cameras)  # Numbers of views: measured, and all
         self._cameras, self._truths = [opened.cameras[i] for i in chosen], [opened.truths[i] for i in chosen]
@@ -250,7 +251,7 @@ class Search:
             if (drop := self.drop(best)) > limit:
                 loss = f"the finest pack loses {drop:.3f} dB at {best.bytes:,} bytes"
                 raise ConfigError(f"{loss}; give a larger --target-drop")
-        for _ in range(7):
+        for _ in range(BISECTIONS):
             middle = (first + last) / 2
             candidate = self._at(middle)
             if self.drop(candidate) <= limit:

@@ -159,12 +159,8 @@ class Pruner:
         return decision
 
     def add(self, count: int, least_opacity: float) -> None:
-        """Add ``count`` Gaussians on top of others, which share their opacity; statistics of densification go.
-
-        ``DataError`` if there are no others.
-        """
-        if not (n := self.total):
-            raise diverged(n)
+        """Add ``count`` Gaussians on top of others, which share their opacity; statistics of densification go."""
+        n = self.total
         grow(self.params, self.optimizers, count, least_opacity)
         for state in self.states:
             state.update(dict.fromkeys(name for name, value in state.items() if per_gaussian(value, n)))

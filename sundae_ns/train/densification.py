@@ -14,6 +14,7 @@ from gsplat.strategy import DefaultStrategy
 from torch import Tensor
 
 from sundae_ns.core.values import usual_defaults
+from sundae_ns.pruning.decision import diverged
 from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
 STATISTICS = ("grad2d", "count", "radii")  # Tensors [N] in the running state of gsplat's strategy
@@ -109,13 +110,15 @@ class Densification(Callback):
             )
 
     def after_step(self, run: TrainingRun) -> None:
-        """Let the strategy add, move and remove Gaussians."""
+        """Let the strategy add, move and remove Gaussians; ``DataError`` if none is left."""
         state = run.state
         if state.densifying:
             with usual_defaults():  # of the tensors that gsplat makes
                 self.strategy.step_post_backward(
                     state.gaussians.data, state.optimizers, state.densification, state.schedule_step, state.info
                 )
+            if not state.gaussians.num_gaussians and run.images_per_step == 1:  # the shard of a rank may be empty
+                raise diverged(0)
 
 
 def make_strategy(options: Any, num_images: int) -> CappedStrategy:

@@ -11,7 +11,7 @@ from torch import Tensor
 from trial_runs import same
 
 from sundae_ns.core.camera import crop_image
-from sundae_ns.core.errors import BackendError, CheckpointError, ConfigError
+from sundae_ns.core.errors import BackendError, CheckpointError, ConfigError, DataError
 from sundae_ns.core.gaussians import Gaussians, sh_to_rgb
 from sundae_ns.core.metrics import psnr
 from sundae_ns.pruning.decision import decide
@@ -141,6 +141,12 @@ def test_nothing_grows_after_the_prune(build, training_of, prune_at):
     assert (max(counts[:prune_at], default=0) > N) == (prune_at > 0)
     assert len(set(counts[prune_at:])) == 1
     assert counts[-1] == round(0.5 * (N if prune_at == 0 else counts[prune_at - 1]))
+
+
+def test_a_field_that_loses_its_last_gaussian_ends_the_training(build, training_of):
+    training = training_of(build(pruning={"prune_at": 9}, cull_alpha_thresh=1.0, **GROWTH))
+    with pytest.raises(DataError, match="no Gaussian is left: all became transparent"):
+        list(map(training.step, range(9)))
 
 
 def test_a_prune_merges_colours(build, training_of, datamanager):

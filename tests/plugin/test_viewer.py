@@ -87,7 +87,7 @@ def test_the_slider_tells_what_fewer_primitives_lose():
         controls._show_expected(controls.keep_ratio)
         assert controls.expected.value == text
     assert expected_change(points, N // 3, round(N / math.sqrt(3))) == pytest.approx((0.3, 0.0075), abs=0.01)
-    assert model.count_curve() == []
+    assert model.viewer_controls._curve() == []
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -123,8 +123,7 @@ def test_what_is_shown_is_what_the_prune_leaves(options):
     pruning, contribute = model.config.pruning, lambda count: model.contribution(cameras, count)
     pruning.keep_ratio = 0.2
     optimizers = {name: torch.optim.Adam([value], lr=1e-3) for name, value in model.gauss_params.items()}
-    pruner = Pruner(model.state.gaussians, optimizers)
-    report = prune_when_due(pruning, pruner, dict(UNPRUNED), pruning.prune_at, contribute)
+    report = prune_when_due(pruning, Pruner(model.gauss_params, optimizers), dict(UNPRUNED), 10**6, contribute)
     assert report["after"] == int(preview.decision.mask.sum()) == 18
     assert all(torch.equal(value, preview.gaussians[name]) for name, value in model.state.gaussians.items())
     # A merge and growth show in the picture too.

@@ -212,15 +212,11 @@ def saved(state, stage="", kept=(), **progress):
     return trials.state_dict()
 
 
-def test_a_checkpoint_without_a_decision_names_the_option(undecided):
+@pytest.mark.parametrize(("stage", "kept"), [("head", ("start",)), ("count", ()), ("length", ("plain",))])
+def test_a_state_without_a_decision_or_a_field_to_go_back_to_is_refused(undecided, stage, kept):
     model, trials = undecided
     with pytest.raises(CheckpointError, match=r"--pipeline.model.head.mode"):
         trials.prepare_loading(model.state, {})
-
-
-@pytest.mark.parametrize(("stage", "kept"), [("head", ("start",)), ("count", ()), ("length", ("plain",))])
-def test_a_state_without_a_field_to_go_back_to_is_refused(undecided, stage, kept):
-    model, trials = undecided
     tried = [Tried("head", 9, "plain", 9)]
     with pytest.raises(CheckpointError, match="^.*lacks a field.*$"):
         trials.load_state_dict(model.state, saved(model.state, stage, kept, tried=tried))
