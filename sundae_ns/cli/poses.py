@@ -48,7 +48,6 @@ def poses(photos: Input, out: Out, options: Plain[PoseOptions] = PoseOptions()) 
     """
     masks = check_poses(photos, options)
     check_folder(out, reads=[], outside=photos)
-    reconstruct.pycolmap()
     request = reconstruct.Request(photos, out, options.matching, options.frames, masks)
     placed = _interruptible(lambda: reconstruct.find_poses(request, _report, _warn), request.work)
     counts = f"{len(placed.placed):,} of {placed.total:,} photos have a pose, of {placed.cameras} camera"
@@ -65,7 +64,7 @@ def poses(photos: Input, out: Out, options: Plain[PoseOptions] = PoseOptions()) 
 
 def check_poses(photos: Path, options: PoseOptions, *, remarks: bool = True) -> Path | None:
     """Check photos or a video by headers, print ``remarks``; the folder of masks, by default one beside the photos."""
-    reconstruct.check_installed()
+    reconstruct.pycolmap()
     check_least(frames=(options.frames, LEAST_PHOTOS))
     warn: Callable[[str], object] = _warn if remarks else str
     if is_video(photos):

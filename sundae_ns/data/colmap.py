@@ -54,11 +54,9 @@ class ColmapImage(NamedTuple):
 
 def read_images(model: Path, kinds: Sequence[str] = ("txt", "bin")) -> dict[int, ColmapImage]:
     """The images of a model by their numbers, with their cameras; ``DataError`` names the first unusable entry."""
-    if not model.is_dir():
-        raise DataError(f"{model} is not a folder; give that of the model with colmap --colmap-path (usually sparse/0)")
     if not (present := [kind for kind in kinds if (model / f"cameras.{kind}").exists()]):
-        near = beside(model / "cameras.bin")
-        raise DataError(f"{model} holds neither cameras.bin nor cameras.txt{near}; give --colmap-path another folder")
+        none = f"{model} holds neither cameras.bin nor cameras.txt{beside(model / 'cameras.bin')}"
+        raise DataError(f"{none}; give colmap --colmap-path the folder of the model, usually sparse/0")
     kind = present[0]
     cameras, images = dict[int, ColmapCamera](), dict[int, ColmapImage]()
     numbers = dict[str, int]()
@@ -70,6 +68,8 @@ def read_images(model: Path, kinds: Sequence[str] = ("txt", "bin")) -> dict[int,
             names = COLMAP_LENSES[lens := colmap_model(name, where)][2].split()
             if len(params) != len(names):
                 raise DataError(f"{where}: {lens} has {len(names)} parameters, not {len(params)}; export it again")
+            if any(map(math.isnan, params)):  # so RealityScan writes a lens that it has not found
+                raise DataError(f"{where}: its lens is NaN; leave its images out of the export, or remove them here")
             for name, value in zip(names, params, strict=True):
                 finite(value, f"parameter {name}", where, positive=name.startswith("f"))
             size = side(width, "width", where), side(height, "height", where)
@@ -140,7 +140,7 @@ def _content(path: Path) -> Iterator[bytes]:
 def _cameras(content: bytes, text: bool) -> Iterator[tuple[int, str | int, int, int, tuple[float, ...]]]:
     if text:
         for number, name, width, height, *params in _rows(content):
-            yield int(number), name, int(width), int(height), tuple(map(float, params))
+            yield int(number), name, int(width), int(height), tuple(float(word.split("(")[0]) for word in params)
         return
     at = _COUNT.size
     for _ in range(*_COUNT.unpack_from(content)):

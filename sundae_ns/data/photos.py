@@ -5,6 +5,7 @@ from __future__ import annotations
 import filecmp
 import importlib
 import os
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
@@ -28,6 +29,9 @@ LEAST_PHOTOS = 3  # with a pose that a scene needs, because nerfstudio holds out
 _COPIED = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}
 _CONVERTED = ("TIFF", "WEBP", "BMP", "HEIF")
 _MASKS = ("masks", "mask")  # names of folders whose images are masks
+_MAP = re.compile(r"(?i)(?:.*[\W_])?(?:mask|depth|conf|confidence|normals?)(?:[\W_].*|\d*)")  # of maps of photos
+# Names of the mask of a photo, by its path: of RealityScan, Metashape, COLMAP, and others.
+_MASK_NAMES = ("{0.name}.mask.png", "{0.stem}_mask.png", "{0.name}", "{0.name}.png", "{0.stem}.png", "{0.stem}.jpg")
 Warn = Callable[[str], object]  # called with a remark in one line
 
 
@@ -140,6 +144,8 @@ def photo_of(path: Path) -> Photo:
         size = images.check_image(path)
         with images.opened(path) as image:
             kind = str(image.format)
+            if image.mode in ("1", "L", "P", "I;16") and _MAP.fullmatch(path.stem):
+                raise DataError(f"{path} is a mask or another map by its name; move masks into a folder {_MASKS[0]}")
             suffix = _COPIED.get(kind, ".png" if image.has_transparency_data else ".jpg")
             orientation = images.orientation_in(image)
             as_it_is = kind in _COPIED and orientation == 1 and images.is_srgb(image)
@@ -176,7 +182,7 @@ def masks_of(photos: Sequence[Photo], folder: Path) -> list[Path]:
     root = Path(os.path.commonpath([photo.path.parent for photo in photos]))
     masks: list[Path] = []
     for path, _, wanted, _, _ in photos:
-        names = (path.name, f"{path.name}.png", f"{path.stem}.png", f"{path.stem}.jpg")
+        names = [form.format(path) for form in _MASK_NAMES]
         folders = folder / path.parent.relative_to(root), path.parent / folder.name, folder
         if (mask := next((beside / n for beside in folders for n in names if (beside / n).is_file()), None)) is None:
             raise DataError(f"{path} has no mask {path.stem}.png in {folder}; add it, white where pixels count")

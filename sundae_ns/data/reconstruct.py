@@ -6,7 +6,6 @@ features that exist are kept, and COLMAP passes over pairs of its database that 
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import shutil
@@ -52,22 +51,15 @@ class Request(NamedTuple):
 def pycolmap() -> Any:
     """The silenced module; ``ConfigError`` if it is not installed or cannot be loaded."""
     # The main thread imports it first: its library takes over SIGTERM to print a stack.
-    check_installed()
     before = signal.getsignal(signal.SIGTERM)
     try:
         import pycolmap as module
     except ImportError as error:
-        raise ConfigError(f"pycolmap cannot be loaded ({error}); install it again with {INSTALL}") from error
+        raise ConfigError(f"camera poses need pycolmap ({error}); install it with {INSTALL}") from error
     if before is not None and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, before)
     module.logging.minloglevel = module.logging.Level.FATAL.value
     return module
-
-
-def check_installed() -> None:
-    """Raise ``ConfigError`` if pycolmap is not installed; imports nothing."""
-    if importlib.util.find_spec("pycolmap") is None:
-        raise ConfigError(f"camera poses need pycolmap; install it with {INSTALL}")
 
 
 def threads() -> int:

@@ -83,6 +83,8 @@ ODD = {
     "text": (lambda path: path.write_text("not a photo"), "cannot identify image file"),
     "another format": (lambda path: photo(path, "ppm"), "is a PPM file by its contents"),
     "floats": (lambda path: photo(path, "tiff", "F"), "pixels of type F"),
+    "a mask of RealityScan": (lambda path: photo(path.with_name("0.png.mask.x.png"), mode="L"), "is a mask or another"),
+    "a depth map": (lambda path: photo(path.with_name("depth_0.x.png"), mode="I;16"), "is a mask or another"),
     "a bomb of text": (zipped_text, "Decompressed data too large"),
     "a panorama": (lambda path: Image.new("RGB", (32, 16)).save(path, "WEBP", xmp=SPHERE), "are panoramas: cut"),
     "a cylinder": (lambda path: Image.new("RGB", (32, 16)).save(path, "WEBP", xmp=CYLINDER), "a panorama: leave it"),
@@ -132,7 +134,7 @@ def test_too_few_photos_and_folders_that_are_none(photos):
 )
 def test_photos_that_are_not_read_are_named(photos, monkeypatch, capsys, names, heif, remark):
     monkeypatch.setattr(module.images, "reads_heif", lambda: heif)
-    monkeypatch.setattr(reconstruct, "check_installed", lambda: None)
+    monkeypatch.setattr(reconstruct, "pycolmap", lambda: None)
     assert left_out(photos) is None
     for name in names:
         (photos / name).parent.mkdir(exist_ok=True)
@@ -155,7 +157,7 @@ def test_photos_in_several_folders_only_are_counted_and_not_opened(tmp_path):
     assert paths_of(tmp_path / "DCIM") == paths
 
 
-@pytest.mark.parametrize("name", ["a.jpg", "a.jpg.png", "a.png"])
+@pytest.mark.parametrize("name", ["a.jpg", "a.jpg.png", "a.png", "a.jpg.mask.png", "a_mask.png"])
 @pytest.mark.parametrize(("orientation", "size"), [(1, (16, 12)), (6, (12, 16)), (8, (12, 16))])
 def test_the_mask_of_a_photo_has_its_upright_size(tmp_path, name, orientation, size):
     path = photo(tmp_path / "photos" / "a.jpg", "jpeg", orientation=orientation)

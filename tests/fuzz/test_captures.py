@@ -190,10 +190,6 @@ def _twice(model):
     (model / "cameras.bin").write_bytes(struct.pack("<Q", 2) + (model / "cameras.bin").read_bytes()[8:] * 2)
 
 
-def _folder(file):
-    return lambda model: ((model / file).unlink(missing_ok=True), (model / file).mkdir())
-
-
 _NAME = 8 + 64 + len("frame_00001.png") + 1  # offset of the first image's number of observations
 ROW = "1 1 0 0 0 0 0 3 1"
 MODELS = {
@@ -203,6 +199,7 @@ MODELS = {
     "fewer points": (_patch("points3D.bin", 0, "<Q", 3), r"points3D.bin of COLMAP \(its entries take \d+ bytes, it"),
     "a track of 2^31": (_patch("points3D.bin", 8 + 43, "<Q", 1 << 31), "is not a complete points3D.bin"),
     "a focal length of 0": (_patch("cameras.bin", 8 + 24, "<d", 0.0), "camera 1: parameter fx is 0.0"),
+    "a lens of RealityScan": (lambda model: _text(model, ROW, "1 RADIAL 9 9 9 4 4 -nan(ind) 0"), "1: its lens is NaN"),
     "a width of 0": (_patch("cameras.bin", 8 + 8, "<Q", 0), "width is 0"),
     "another camera model": (_patch("cameras.bin", 8 + 4, "<i", 7), "not support camera model FOV"),
     "an unknown camera model": (_patch("cameras.bin", 8 + 4, "<i", 99), "camera model 99 is not known here"),
@@ -224,16 +221,17 @@ MODELS = {
     "a number twice": (lambda model: _text(model, f"{ROW} a.png\n\n{ROW} b.png"), "image 1: .* is listed twice"),
     "a name twice": (lambda model: _text(model, f"{ROW} a.png\n\n2{ROW[1:]} a.png"), "image 2: .*'a.png' is .* twice"),
     "another text": (lambda model: write_text_model(model, ["a.png"]), "a text and a binary model that differ; remove"),
-    "a folder in the place of a file": (_folder("cameras.bin"), "cannot be read"),
+    "a folder in its place": (lambda model: ((file := model / "cameras.bin").unlink(), file.mkdir()), "cannot be read"),
     "invalid UTF-8": (lambda model: (model / "cameras.txt").write_bytes(b"1 PIN\xff\xfe"), "cameras.txt .*utf-8"),
     "a pose of 6 numbers": (lambda model: _text(model, "1 1 0 0 0 0 0 1 a.png"), "images.txt .*6 numbers as its pose"),
     "a missing image": (lambda model: next((model.parents[1] / "images").iterdir()).unlink(), "does not exist"),
 }
 
 
-def _text(model, image):
+def _text(model, image, *cameras):
     as_text(model.parents[1])
     (model / "images.txt").write_text(f"{image}\n\n")
+    (model / "cameras.txt").write_text("\n".join(cameras or [(model / "cameras.txt").read_text()]))
 
 
 def _written(text):
