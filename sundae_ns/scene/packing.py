@@ -17,7 +17,7 @@ from sundae_ns.io.coordinates import Direction
 from sundae_ns.io.pack.codecs import Sensitivity
 from sundae_ns.io.pack.container import FORMAT, fault
 from sundae_ns.io.pack.packed_scene import PackedScene
-from sundae_ns.rasterize.reference import harmonic_basis
+from sundae_ns.rasterize.reference import MIN_ALPHA, harmonic_basis
 from sundae_ns.scene.cameras import is_frame, spread
 from sundae_ns.scene.render import GaussianSource, render_view
 from sundae_ns.scene.scene import Scene, unit
@@ -58,8 +58,10 @@ def scene_of(packed: PackedScene) -> Scene:
 
 
 def contents_of(scene: Scene) -> PackedScene:
-    """The contents of a packed file for the finite Gaussians of a scene, with how much its cameras see of errors."""
-    scene = replace(scene, gaussians=sanitise(scene.gaussians).gaussians).to("cpu")
+    """The contents of a packed file for the Gaussians of a scene that are drawn, with what cameras see of errors."""
+    finite = sanitise(scene.gaussians).gaussians
+    drawn = finite["opacities"][:, 0].sigmoid() >= MIN_ALPHA  # training leaves others, some narrower than any cell
+    scene = replace(scene, gaussians=finite.rows(drawn) if bool(drawn.any()) else finite).to("cpu")
     head = {} if scene.head is None else dict(scene.head.state_dict())
     gaussians = {name: value.detach() for name, value in scene.gaussians.items() if name != FEATURES or head}
     required = _MODEL["properties"]["head"]["required"]

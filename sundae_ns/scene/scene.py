@@ -227,7 +227,7 @@ class Scene:
     def settings(self, backend: BackendName = "auto", *, head: bool = True) -> RenderSettings:
         """Settings that render the scene with all of its SH degrees; ``BackendError`` without the rasteriser."""
         rasteriser, enabled = select_backend(backend, self.device), self.head if head else None
-        near = min(NEAR_PLANE, self.extent / 10)  # a scene of millimetres would lie behind the usual one
+        near = NEAR_PLANE * min(1.0, self.extent)  # a scene of millimetres would lie behind the usual one
         settings = RenderSettings(rasteriser, head=enabled, trained_focal=self.trained_focal, near_plane=near)
         return replace(settings, antialiased=self.antialiased)
 
@@ -318,7 +318,7 @@ def usable(scene: Scene) -> Gaussians:
 
 def middle_and_reach(gaussians: Gaussians) -> tuple[Tensor, float]:
     """Median of the centres ``[3]``, float64 on the CPU, and their median distance from it; in one place, a size."""
-    means = gaussians["means"].double()
+    means = gaussians["means"].detach().double()
     middle = means.median(dim=0).values
     if (reach := float((means - middle).norm(dim=1).median())) == 0:
         reach = 3 * float(gaussians["scales"].double().amax(dim=1).median().exp())

@@ -119,8 +119,7 @@ def test_survey_coordinates_are_moved_stated_and_kept(tmp_path, kind, caplog):
     assert sn.cameras_of(tmp_path / "c.json", back if kind == ".sundae" else scene)[0].center[0] == 4e6 + 1 - offset[0]
 
 
-def test_rows_of_a_survey_keep_their_digits_in_text_and_in_a_prune(tmp_path):
-    """Also where the text states floats."""
+def test_rows_of_a_survey_keep_their_digits_in_text_that_states_floats_and_in_a_prune(tmp_path):
     truth, mask, path = write_survey(tmp_path / "a.ply", 5e5), torch.arange(300) < 200, tmp_path / "text.ply"
     write_columns(path, columns_of(tmp_path / "a.ply"), text=True)
     path.write_bytes(path.read_bytes().replace(b"property double ", b"property float "))
@@ -169,7 +168,8 @@ def test_what_cannot_be_loaded_is_not_saved(tmp_path, kind, name, change):
     gaussians[name] *= change  # logarithms of widths become 120 to 240
     with suppress(sn.SundaeError):
         sn.save(sn.Scene(Gaussians(gaussians)), path)
-    assert not path.exists() or sn.load(path).num_gaussians == 300
+    faint = int((gaussians["opacities"] < -6).sum()) if kind == ".sundae" else 0  # a pack leaves them out
+    assert not path.exists() or sn.load(path).num_gaussians == 300 - faint
 
 
 def test_upright_rotates_z_to_minus_y(tmp_path):
