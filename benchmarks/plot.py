@@ -29,6 +29,8 @@ STYLES = {
 """Markers and colours of methods."""
 RULES = {"detail-merge": "default", "contribution-top": "contribution", "random": "random", "paper": "paper's band"}
 """Rules of the prune that are shown, and their names."""
+CHANGED = "default, exposures changed"
+LIGHT = {"default": "photos as they are", CHANGED: "compensation auto", f"{CHANGED}, compensation off": "off"}
 
 
 def logarithmic(panel: Any, ticks: list[float]) -> None:
@@ -94,13 +96,8 @@ def lines(panel: Any, name: str, series: Callable[[dict[str, Any]], Any], x: str
 
 
 def few_photos(row: dict[str, Any]) -> str | None:
-    complete = row["views"] in ("12", "16", "24") and row["seed"] == "42"
+    complete = row["views"] in ("12", "16", "24")
     return row["arm"] if complete and row["arm"] in ("default", "5%", "before the prune", "splatfacto") else None
-
-
-def changed_light(row: dict[str, Any]) -> str | None:
-    mode, _, kind = row["arm"].partition(", ")
-    return f"compensation {mode}" if kind == "default, exposures changed" else None
 
 
 def plot_asked() -> Any:
@@ -109,7 +106,7 @@ def plot_asked() -> Any:
     lines(sizes, "sizes_asked.csv", lambda row: row["source"] == "trained" and row["capture"], "got_mb", "psnr")
     lines(levels, "levels.csv", lambda row: row["tool"], "share", "psnr_to_field")
     lines(few, "few_counts.csv", few_photos, "views", "psnr")
-    lines(light, "gains.csv", changed_light, "capture", "psnr")
+    lines(light, "few_counts.csv", lambda row: row["views"] == "40" and LIGHT.get(row["arm"]), "capture", "psnr")
     for marker, strength in zip("os", ("0.25", "0.5")):
         fields = [row for row in lines_of("cleaning.csv") if (row["kind"], row["strength"]) == ("all", strength)]
         spots = [(float(row["psnr_lost"]), int(row["removed"])) for row in fields]
@@ -119,7 +116,8 @@ def plot_asked() -> Any:
     levels.set(title="levels, mean of fields", xlabel="share of Gaussians", ylabel="PSNR to the field, dB")
     cleaning.set(title="cleaning by strength", xlabel="PSNR lost, dB", ylabel="floaters found of 400", ylim=(360, 401))
     few.set(title="few photos, mean of seven captures", xlabel="training views", ylabel="test PSNR, dB")
-    light.set(title="exposures changed by 15%", ylabel="test PSNR, dB", xmargin=0.3, ymargin=0.3)
+    light.set(title="40 views, exposures changed by 15%", ylabel="test PSNR, dB", ymargin=0.2)
+    light.tick_params(axis="x", labelrotation=30)
     lines(rules, "rules.csv", lambda row: row["scene"] == "bonsai" and RULES.get(row["rule"]), "keep", "psnr")
     rules.set(title="rules, bonsai, no head", xlabel="share of Gaussians", ylabel="test PSNR, dB")
     return figure
