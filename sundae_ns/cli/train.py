@@ -41,7 +41,7 @@ class TrainOptions(Wishes):
         self.check_wishes()
         if self.count is not None and self.cleans:
             raise ConfigError(f"a training reaches --count before {self.cleans[0]} cuts; give both to sundae pack")
-        check_least(steps=(self.steps, 1))
+        check_least(steps=(self.steps, 1), seed=(self.advanced.seed, 0))
 
     def words(
         self, capture: Path, out: Path, more: Sequence[str] = (), *, tunes: bool = False, masks: Path | None = None

@@ -211,14 +211,13 @@ def _lengths(weights: Tensor) -> Tensor:
 
 
 def _label_either_way(graph: NeighborGraph, label: Tensor, distance: Tensor) -> Tensor:
-    """Label the Gaussians without a label, along edges in both directions."""
+    """Label the Gaussians without a label, in place, along edges in both directions."""
     unlabelled = label < 0
     rows, slots = ((unlabelled[:, None] | unlabelled[graph.indices]) & (graph.weights > 0)).nonzero(as_tuple=True)
     ends, length = graph.indices[rows, slots], _lengths(graph.weights[rows, slots])
     source, target, length = torch.cat([rows, ends]), torch.cat([ends, rows]), torch.cat([length, length])
     wanted = unlabelled[target]
     source, target, length = source[wanted], target[wanted], length[wanted]
-    label, distance = label.clone(), distance.clone()
     for _ in range(MOST_HOPS):
         over = distance[source] + length
         reached = distance.scatter_reduce(0, target, over, "amin")

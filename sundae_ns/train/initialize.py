@@ -78,7 +78,8 @@ def _sparse_gaussians(options: Any, points: Points | None) -> tuple[dict[str, Te
     warnings: list[str] = []
     cap = options.pruning.cap
     if points is not None and len(points[0]) > 0 and not options.random_init:
-        xyz, rgb = points[0], points[1].float() / 255 if len(points[1]) else torch.full_like(points[0], 0.5)
+        xyz, colours = points
+        rgb = colours.float() / 255 if len(colours) else torch.full_like(xyz, 0.5)
         if len(xyz) < FEWEST_POINTS:
             few = "its photos hardly overlap and the scene will be poor; add photos between them"
             warnings.append(f"the capture has only {len(xyz)} sparse points: {few}")

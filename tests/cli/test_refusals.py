@@ -85,7 +85,7 @@ REFUSALS = {
     "render in.sundae -o a.png --view 0 --preview ./a.png --remove-floaters": "a.png is the image and its --preview",
     "render in.sundae -o a.png --cameras in.ply": "); give a transforms.json, the folder of a COLMAP model, or",
     "render in.sundae -o a.png --cameras none.json": "none.json",
-    "train scene --keep 0": "keep is 0.0",
+    "train scene --seed -1": "seed is -1; give at least 0",
     "train scene --count 9 --crop 0 0 0 1 1 1": "reaches --count before --crop cuts; give both to sundae pack",
     "train scene --method splatfacto": "splatfacto is no method of sundae; use one of sundae, ",
     "train empty": "empty has no transforms.json; ",
