@@ -47,7 +47,7 @@ def export(
     Args:
         out: file to write; its suffix selects the format: .html, .ply or .glb (exact), .spz or .sog (quantised,
             much smaller). A name without a suffix is a folder of page and scene, for a web server.
-        beside: another scene, which the page shows as it is beside the first one, by the same camera.
+        beside: another scene, which the page shows unchanged beside the first one, by the same camera.
         views: views that the page names, each with a link that its button Copy link gives.
         lod: write levels of detail as streamed SOG (lod-meta.json) into the folder, for PlayCanvas's viewers. Below
             the full scene are a half, a quarter and a tenth of it, pruned and trained on its images; minutes on a GPU.

@@ -41,7 +41,7 @@ from sundae_ns.scene.virtual_cameras import VIEWS, virtual_cameras
 
 
 class Edit(NamedTuple):
-    """A scene, what a command asks of it, and what is left of it so far."""
+    """A scene, the options of a command for it, and the result so far."""
 
     source: Path
     wishes: Wishes
@@ -80,7 +80,7 @@ class Edit(NamedTuple):
         return self._replace(scene=self.scene[mask], rows=within(self.rows, mask.cpu()))
 
     def cleaned(self) -> Edit:
-        """Without a head, what is outside the box, and floaters, if they should go."""
+        """The scene without a head, Gaussians outside the box and floaters, as the options ask."""
         edit = self._replace(scene=replace(self.scene, head=None)) if self.details.no_head else self
         if not self.wishes.cleans:
             return edit
@@ -111,7 +111,7 @@ class Edit(NamedTuple):
         rounds: bool = True,
         write: Callable[[Edit, Path], object] | None = None,
     ) -> Edit:
-        """What the options leave of the scene; ``out`` is the file, or one like it, to be written.
+        """The scene that the options leave; ``out`` is the file, or one like it, to be written.
 
         ``rounds`` says whether a size also decides how it is rounded; ``write`` makes what has the size, if not a file.
         """
@@ -151,7 +151,7 @@ class Edit(NamedTuple):
             return after(pruned, form)._replace(file=file)
 
     def for_page(self, out: Path = Path("page.html"), write: Callable[[Path, Shown], object] = write_page) -> Shown:
-        """Name, scene and packed file of what a page shows, which ``write`` makes; a packed scene stays as it is."""
+        """Name, scene and packed file of what a page shows, which ``write`` makes; a packed scene does not change."""
         source = self.source.resolve()
         name = (source.parent if source.name == "scene.sundae" else source).stem  # sundae run names all packs so
         if is_run(self.source):  # its file is CAPTURE/METHOD/TIME/config.yml

@@ -268,7 +268,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             raise DataError(f"{nothing}; check their alpha channel and their masks")
         if split == "train" and (transparent := sum(batch["image"].shape[-1] == 4 for batch in loaded)):
             what = f"{transparent} of {len(loaded)} training images have an alpha channel"
-            _log.info(f"{what}: what is transparent is trained to be empty space; to leave pixels out, give masks")
+            _log.info(f"{what}: transparent pixels are trained as empty space; to leave pixels out, give masks")
         return loaded
 
 

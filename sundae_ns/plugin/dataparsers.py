@@ -99,7 +99,7 @@ def set_parser(config: DataParserConfig, robust: bool) -> None:
 
 
 def rebound(method: Any, **names: Any) -> Any:
-    """A copy of a function in which global ``names`` have these values; the function itself stays as it is."""
+    """A copy of a function in which global ``names`` have these values; the function itself does not change."""
     scope = {**method.__globals__, **names}
     copy = FunctionType(method.__code__, scope, method.__name__, method.__defaults__, method.__closure__)
     copy.__kwdefaults__ = method.__kwdefaults__

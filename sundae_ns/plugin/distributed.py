@@ -6,8 +6,8 @@
       render             own image, by the rasteriser of one GPU
 
 A batch of R images counts as R steps: the first of them trains, the others only move clock and schedules. So options,
-checkpoints and records mean the same on any number of GPUs. What is not a training step (prune, evaluation, checkpoint)
-is done by the first rank alone, on all Gaussians, by the code of one GPU.
+checkpoints and records mean the same on any number of GPUs. The first rank alone does everything else (prune,
+evaluation, checkpoint), on all Gaussians, by the code of one GPU.
 
 All ranks must call a function marked "Collective" together. ``docs/several_gpus.md`` describes the product.
 """

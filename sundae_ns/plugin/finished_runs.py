@@ -55,7 +55,7 @@ _PARSERS: dict[str, type[DataParserConfig]] = {
     "colmap": ColmapDataParserConfig,
     "nerfstudio-data": NerfstudioDataParserConfig,
 }
-_ALPHA_COLORS = ("white", "black", None)  # Colours that a packed scene may name for what is transparent in its images
+_ALPHA_COLORS = ("white", "black", None)  # Colours that a packed scene may name for transparent pixels
 _FOLDER = re.compile(r"(?!.*\.\.)[\w.-]+(/[\w.-]+)*")
 """Paths that a packed scene may name: below the capture, and without special characters of a shell, because nerfstudio
 passes paths of images to ffmpeg through one."""
@@ -78,7 +78,7 @@ class Opened:
     packed_bytes: int | None = None  # Size of the file; None for a run
     pipeline: Any = None  # nerfstudio's pipeline of a run
     cameras: list[Cameras] = field(default_factory=list)  # Test cameras, each of shape (1,), on the model's device
-    truths: list[Tensor] = field(default_factory=list)  # True images [H, W, 3] over the model's background, likewise
+    truths: list[Tensor] = field(default_factory=list)  # True images [H, W, 3] over the model's background, there too
 
     @property
     def scene(self) -> str:

@@ -66,7 +66,7 @@ class PruneRule:
 
     @property
     def refits(self) -> bool:
-        """Whether :func:`sundae_ns.prune` fits what is left to the images of the views; training does so by itself."""
+        """Whether :func:`sundae_ns.prune` fits the kept Gaussians to images of the views, as training does anyway."""
         return self.selection == "pairs" and self.redistribution == "merge"
 
     def validate(self) -> None:

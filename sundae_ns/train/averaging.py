@@ -90,7 +90,7 @@ class Averaging(Callback):
         self.share, self.settled_at = share, settled_at
         self._mean = RunningMean()
         self._restored = 0  # Returns to a snapshot that the field had made when the mean began
-        self._replaced: dict[str, Tensor] = {}  # Weights of the last step, from which a longer training goes on
+        self._replaced: dict[str, Tensor] = {}  # Weights of the last step, from which a longer training continues
         self._alone = True
 
     def state_dict(self) -> dict[str, Any]:
@@ -127,5 +127,5 @@ class Averaging(Callback):
         if state.step == last and (replaced := self._mean.replace(weights)):
             _log.info(f"step {state.step}: the weights are the mean of {self._mean.count} of the last steps")
             self._replaced = replaced if self._alone else {}
-            if last >= run.schedule_length - 1:  # after a part, the mean goes on with the rest of the run
+            if last >= run.schedule_length - 1:  # after a part, the mean continues with the rest of the run
                 self._mean = RunningMean()

@@ -147,7 +147,7 @@ class StepRecordings:
     def run(
         self, work: StepWork, inputs: StepInputs, settings: RenderSettings, kind: Hashable, addresses: Hashable = None
     ) -> StepResult | None:
-        """Run a step, by a recording where there is one; None if steps cannot be recorded, and nothing has changed.
+        """Run a step, by its recording if there is one; None if steps cannot be recorded, and nothing has changed.
 
         ``kind`` decides on the kernels of the step; ``addresses`` are of what a recording reads beside its inputs,
         where they may change. The backend of ``settings`` is gsplat for recording.

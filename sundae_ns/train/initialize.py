@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 FEWEST_POINTS = 50  # With fewer sparse points a user hears that photos overlap too little
 SIDES = {"cuda": 640, "cpu": 160}  # Longest side of the swept images, pixels; a CPU takes a second a view
 MOST_ON_CPU = 24  # Most views that a CPU sweeps
-FILLED = {"cuda": 100_000, "cpu": 20_000}  # Points up to which a sparse cloud is filled; a larger one stays as it is
+FILLED = {"cuda": 100_000, "cpu": 20_000}  # Points up to which a sparse cloud is filled; a larger one is not
 Points = tuple[Tensor, Tensor]  # Positions [N, 3] and colours in 0 to 255 [N, 3]
 Frame = tuple[Tensor, float]  # Transform [3, 4] and scale from the capture's coordinates to those of the model
 

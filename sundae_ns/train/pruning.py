@@ -30,7 +30,7 @@ from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
 _log = logging.getLogger(__name__)
 
-USUAL_SHARE = 0.1  # Share that a prune keeps unless it is told otherwise
+USUAL_SHARE = 0.1  # Share of the Gaussians that a prune keeps by default
 MANY_VIEWS = 32  # With as many, counts are tried, and no length is: captures of 43 training views gain to the end
 USUAL_VIEWS = 16  # Up to as many keep the usual share of the Gaussians, others below MANY_VIEWS more in proportion
 DROPPED, FEW_DROPPED = 0.1, 0.2  # Share of the Gaussians that a step after the prune leaves out; with few views

@@ -104,7 +104,7 @@ def notify_pruned(
     """Restart every :class:`Decay` among ``schedulers`` at the ``step`` of a prune; later calls change nothing.
 
     ``count`` Gaussians were kept; of fewer than :data:`SPARSE` the centres move faster. ``last`` is False while pruning
-    goes on or the head is still disabled: rates that hold until then are left alone. They reach their final value at
+    continues or the head is still disabled: rates that hold until then are left alone. They reach their final value at
     the step ``ends_at``, as for a trial; None stands for that of the run.
     """
     for name, scheduler, decay in _decays(schedulers):

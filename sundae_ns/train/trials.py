@@ -11,8 +11,8 @@ pay:
     If more than the usual share is chosen, or bytes are limited, that share is trained without and with a head: there
     it gains the sooner.
 ``head``
-    Whether training goes on plain, with a head, or with one of more features (``head.mode auto``), unless ``tenth`` has
-    told. Where views are few or differ, a head fits their differences. The chosen trial goes on.
+    Whether training continues plain, with a head, or with one of more features (``head.mode auto``), unless ``tenth``
+    has decided. Where views are few or differ, a head fits their differences. The chosen trial continues.
 ``length``
     How long few views are trained on. The views of the last trial stay held out. Once their loss grows, training goes
     back (stage ``repeat``), takes as many steps on all views as were best, and is paused.
@@ -233,7 +233,7 @@ class Trials(Callback):
             raise CheckpointError("the checkpoint lacks a field that its trials would return to; give another")
 
     def trains(self, state: TrainingState) -> bool:
-        """False while training is paused. After the end of the schedule it goes on: the user has asked for more."""
+        """False while training is paused. It continues after the end of the schedule: the user has asked for more."""
         return self.progress.stage != "paused" or state.schedule_step >= self.progress.steps
 
     def before_training(self, run: TrainingRun) -> None:
@@ -607,7 +607,7 @@ class Trials(Callback):
             self._end_length(run, "repeat", length)
             self.start(run, "repeat", length, [])
         elif state.schedule_step + self._window > progress.watched_until:
-            _log.info(f"step {state.step}: the held-out views lose nothing; training goes on, on all views")
+            _log.info(f"step {state.step}: the held-out views lose nothing; training continues on all views")
             self._end_length(run, "", None)
         else:
             self.start(run, "length", self._window, views)

@@ -214,7 +214,7 @@ def test_alpha_is_named(capture, load, capsys):
     kept = sum(batch["image"].shape[-1] == 4 for batch in made.cached_train)
     assert 0 < kept < VIEWS
     shown = " ".join(capsys.readouterr().out.split())
-    assert f"{kept} of {VIEWS} training images have an alpha channel: what is transparent is trained to be" in shown
+    assert f"{kept} of {VIEWS} training images have an alpha channel: transparent pixels are trained as" in shown
 
 
 @pytest.mark.parametrize("way", ["transparent", "masked", "transparent where it is not masked"])
