@@ -18,12 +18,12 @@ from sundae_ns.core.errors import ConfigError, SundaeError
 from sundae_ns.core.tables import MEGABYTE, without_nan
 from sundae_ns.io.formats import FORMATS, PRIMITIVES, kind_of, kind_of_gaussians
 from sundae_ns.io.pack.config import FINETUNED_SIZE, PackConfig
-from sundae_ns.io.pack.packed_scene import Codecs, PackedScene, fit_scene, pack_bytes, write_fitted
+from sundae_ns.io.pack.packed_scene import fit_scene, pack_bytes, write_fitted
 from sundae_ns.io.run_folder import files_of
 from sundae_ns.scene.packing import contents_of
 
 if TYPE_CHECKING:
-    from sundae_ns.plugin.tuned_packs import Judge
+    from sundae_ns.plugin.tuned_packs import Judge, Tuned
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def pack(
     larger = None if max_mb is None else max_mb / (0.75 * FINETUNED_SIZE if steps else 1)
     left = before._replace(wishes=replace(wishes, max_mb=larger)).reduced(out.with_suffix(".sundae"), rounds=not steps)
     source = contents_of(left.stated)
-    packs: list[tuple[PackedScene, Codecs]] = []
+    packs: list[Tuned] = []
     most = None if max_mb is None else int(max_mb * MEGABYTE)
     with progress_bar() as bar, redirect_stdout(StringIO()):  # nerfstudio's messages
         task = bar.add_task("Fine-tuning" if steps else "Packing", total=2 + steps * (1 if most is None else 2))
@@ -93,7 +93,7 @@ def pack(
         report = write_fitted(out, *packs[0])
         bar.update(task, advance=1, description="Measuring")
         # Photos show what a box leaves out.
-        figures = _measured(judge, packs, steps) if kind is None and wishes.crop is None else {}
+        figures = _measured(judge, packs, report.bytes, steps) if kind is None and wishes.crop is None else {}
     if advanced.json:
         print(dumps(without_nan({"file": str(out), **report.summary(), **figures})))
         return 0
@@ -110,8 +110,8 @@ def pack(
     return 0
 
 
-def _measured(judge: Callable[[], Judge], packs: Sequence[tuple[PackedScene, Codecs]], steps: int) -> dict[str, Any]:
-    """Figures of the run and of the first pack; a second pack is that without the fine-tune."""
+def _measured(judge: Callable[[], Judge], packs: Sequence[Tuned], size: int, steps: int) -> dict[str, Any]:
+    """Figures of the run and of the first pack, of ``size`` bytes; a second pack is that without the fine-tune."""
     from sundae_ns.plugin.tuned_packs import is_worth
 
     try:
@@ -120,8 +120,8 @@ def _measured(judge: Callable[[], Judge], packs: Sequence[tuple[PackedScene, Cod
     except SundaeError as error:
         print(f"the quality is not measured: {error}", file=sys.stderr)
         return {}
-    size, *sizes = (len(pack_bytes(*pack)[0]) for pack in packs)
-    for other, plain in zip(others, sizes, strict=True):
+    for other, pack in zip(others, packs[1:], strict=True):
+        plain = len(pack_bytes(*pack)[0])
         if not is_worth(after.psnr, size, other.psnr, plain):
             lost = f"the fine-tune of {steps:,} steps loses {views.before.psnr - after.psnr:.2f} dB"
             other_lost = f"a pack without it has {plain:,} bytes and loses {views.before.psnr - other.psnr:.2f} dB"
