@@ -10,7 +10,6 @@ H=$PWD R=/tmp/repo J=/tmp/jobs
 export PYTHONPATH=/opt/site PATH=/opt/site/bin:$PATH OMP_NUM_THREADS=4 NUMBA_NUM_THREADS=4 PYTHONUNBUFFERED=1 PYTHONWARNINGS=ignore
 export SLOTS=${SLOTS:-1} GPUS=${GPUS:-2} RESERVED= R
 for c in .gpu/p*/scenes/*; do [ -d $c ] && mkdir -p /tmp/scenes && cp -r $c /tmp/scenes/; done
-[ -d .gpu/cuts ] && python3 lab/uncut.py unpack .gpu/cuts /tmp/scenes
 case $1 in
   setup)
     bash .gpu/setup.sh > /tmp/setup.log 2>&1; tail -n 1 /tmp/setup.log; python3 lab/console_scripts.py
@@ -31,7 +30,7 @@ case $1 in
     done < $H/$2
     ls $J | wc -l ;;
   look)
-    tail -n 12 /tmp/logs/queue.log; bash lab/look.sh; tar -czf $OUT/out.tgz --exclude="*.ckpt" --exclude="*.tmp" --exclude="events.*" --exclude="*.sundae" --exclude="*.jpg" -C /tmp out logs ;;
+    tail -n 12 /tmp/logs/queue.log; tar -czf $OUT/out.tgz --exclude="*.ckpt" --exclude="*.tmp" --exclude="events.*" --exclude="*.sundae" --exclude="*.jpg" -C /tmp out logs ;;
   wait)
     touch $J/END; SECONDS=0
     until grep -q "all done" /tmp/logs/queue.log || [ $SECONDS -gt $2 ]; do sleep 1; done
