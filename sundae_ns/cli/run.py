@@ -67,7 +67,7 @@ class Project:
     @property
     def run(self) -> Path:
         """Folder of the training, as ns-train names it; reports name the scene by its grandparent."""
-        path = self.photos.resolve()
+        path = (self.photos.parent if self.photos.suffix == ".json" else self.photos).resolve()
         return self.out / "runs" / (path.stem if path.is_file() else path.name) / self.train.method / "run"
 
     @cached_property

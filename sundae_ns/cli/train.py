@@ -104,7 +104,7 @@ def train(
     if resume and options.steps is not None:
         raise ConfigError("a resumed run trains its remaining steps; leave out --steps or --resume")
     options.check(capture)
-    if not is_posed(capture) and capture.suffix != ".json" and not any(map(_is_parser, further)):
+    if not is_posed(capture) and not any(map(_is_parser, further)):
         raise no_transforms(capture)
     check_folder(out, reads=[], overwrite=True)
     old, step, length = unfinished_run(out, options.method, capture) or (None, 0, 0)

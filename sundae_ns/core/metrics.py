@@ -26,8 +26,7 @@ logger = logging.getLogger(__name__)
 def check_pair(pred: Tensor, target: Tensor) -> None:
     """Raise DataError unless both are images ``[H, W, 3]`` of one size."""
     if pred.shape != target.shape or pred.dim() != 3 or pred.shape[-1] != 3:
-        shapes = f"{list(pred.shape)} and {list(target.shape)}"
-        raise DataError(f"images have shapes {shapes}; give two of one size, [H, W, 3]")
+        raise DataError(f"images have shapes {[*pred.shape]} and {[*target.shape]}; give two of one size, [H, W, 3]")
 
 
 def psnr(pred: Tensor, target: Tensor) -> Tensor:

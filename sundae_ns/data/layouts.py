@@ -29,8 +29,8 @@ class Layout(NamedTuple):
 
 
 def is_posed(data: Path) -> bool:
-    """Whether a folder has a ``transforms.json``, a COLMAP model in one of the usual places, or Blender's files."""
-    return any((data / name).is_file() for name in ("transforms.json", _BLENDER)) or bool(_model_folders(data))
+    """Whether a path is a ``.json``, or a folder with ``transforms.json``, a COLMAP model or Blender's files."""
+    return data.suffix == ".json" or any([*data.glob("transforms.json"), *data.glob(_BLENDER), *_model_folders(data)])
 
 
 def is_model(folder: Path) -> bool:
@@ -105,6 +105,8 @@ def _blender_layout(data: Path) -> Layout:
             raise DataError(f"{path} lists no frames with a file_path; export it again")
         if any("\\" in str(frame["file_path"]) for frame in frames):
             raise DataError(f"{path} has paths of Windows, which nerfstudio does not find here; write / in place of \\")
+        if (data / str(frames[0]["file_path"])).is_file():  # of BlenderNeRF
+            raise DataError(f"{path} names images with their suffix, unlike Blender's layout; give that file instead")
         lists.append(frames)
     check_image(data / f"{lists[0][0]['file_path']}.png")
     description = f"Blender layout: {len(lists[0]):,} training images, over white"  # as nerfstudio puts them

@@ -28,9 +28,8 @@ LEAST_PHOTOS = 3  # with a pose that a scene needs, because nerfstudio holds out
 # Suffix in a capture by Pillow's format (phones write MPO, several JPEG images); others become JPEG, with alpha PNG.
 _COPIED = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}
 _CONVERTED = ("TIFF", "WEBP", "BMP", "HEIF")
-_MASKS = ("masks", "mask")  # names of folders whose images are masks
+_MASKS = ("masks", "mask")  # folders whose images are masks, by names as of RealityScan, Metashape, COLMAP
 _MAP = re.compile(r"(?i)(?:.*[\W_])?(?:mask|depth|conf|confidence|normals?)(?:[\W_].*|\d*)")  # of maps of photos
-# Names of the mask of a photo, by its path: of RealityScan, Metashape, COLMAP, and others.
 _MASK_NAMES = ("{0.name}.mask.png", "{0.stem}_mask.png", "{0.name}", "{0.name}.png", "{0.stem}.png", "{0.stem}.jpg")
 Warn = Callable[[str], object]  # called with a remark in one line
 

@@ -64,7 +64,8 @@ def test_a_capture_needs_no_poses(commands):
     assert run(*OUT) == 0
     assert started(commands, "out/capture", "-o", "again") == STEPS[1:]
     assert commands.option("--data", 0) == "out/capture"
-    assert not Path("again/capture").exists()
+    assert started(commands, "out/capture/transforms.json", "-o", "of a file") == STEPS[1:]
+    assert "of a file/runs/capture/sundae/run" in commands.ran[1]
 
 
 def test_a_capture_in_colmap_layout_needs_no_poses(commands, capsys):

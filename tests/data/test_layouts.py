@@ -76,6 +76,7 @@ def test_a_capture_of_blender(tmp_path):
         other = blender(tmp_path / str(number), frames=frames)
         refused(posed_layout, other, r"transforms_train\.json lists no frames with a file_path")
     refused(posed_layout, blender(tmp_path / "windows", frames=[{"file_path": "a\\b"}]), "has paths of Windows, .*; ")
+    refused(posed_layout, blender(tmp_path / "b", frames=[{"file_path": "val/0.png"}]), "suffix, .*; give that file")
     assert posed_layout(blender(tmp_path / "noted", note="a\\b"))
 
 
