@@ -19,8 +19,8 @@ const FEW_FRAGMENTS = 2 ** 29;
 const TILE = 16;
 /** Texels in a row of a table. */
 const ROW = 2048;
-/** Buckets of the sort by depth. */
-const BUCKETS = 2 ** 16;
+/** Buckets of the sort by depth, 2,048 in each octave: in coarser ones large Gaussians are blended in a wrong order. */
+const BUCKETS = 2 ** 19;
 /** SH degree that the shader evaluates; higher ones change little. */
 const MOST_DEGREE = 3;
 
@@ -124,7 +124,7 @@ class Painter implements Drawer {
     for (let i = 0; i < count; i++) {
       bits[0] = x! * means[3 * i]! + y! * means[3 * i + 1]! + z! * means[3 * i + 2]! + w!;
       // The upper bits of positive floats have the order of the floats; the last bucket is behind the camera.
-      const key = bits[0]! > 0 ? BUCKETS - 1 - (word[0]! >>> 16) : BUCKETS;
+      const key = bits[0]! > 0 ? BUCKETS - 1 - (word[0]! >>> 12) : BUCKETS;
       keys[i] = key;
       ends[key]! += 1;
     }
