@@ -7,28 +7,16 @@ import time
 import urllib.error
 import urllib.request
 import webbrowser
-from contextlib import contextmanager
 from unittest.mock import Mock
 
 import pytest
-from command_line import run
+from command_line import run, served
 from packed_scenes import KINDS, write_kind
 
 from sundae_ns.cli import view as command
 from sundae_ns.core.errors import ConfigError
 
 SECONDS = 60  # time limit of what takes milliseconds, so only a hang reaches it
-
-
-@contextmanager
-def served(page):
-    """The port of a server of one page."""
-    with command.serve(page, 0) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        host, port = server.server_address[:2]
-        assert host == "127.0.0.1"
-        yield port
-        server.shutdown()
 
 
 def connect(port):
@@ -51,7 +39,7 @@ def until_gone():
 
 
 def test_the_server_has_one_page_and_listens_on_this_machine_only():
-    with served("<p>a scene</p>") as port:
+    with served(command.serve("<p>a scene</p>", 0)) as port:
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/") as answer:
             assert answer.read() == b"<p>a scene</p>"
             assert answer.headers["Content-Type"] == "text/html; charset=utf-8"
@@ -72,7 +60,7 @@ def answer_to(port, *hosts):
 
 def test_only_this_machine_by_name_is_answered():
     """Another site whose name resolves to 127.0.0.1 must not read the scene."""
-    with served("a scene") as port:
+    with served(command.serve("a scene", 0)) as port:
         for host in ("127.0.0.1", "localhost", "[::1]", "LocalHost"):
             assert answer_to(port, f"{host}:{port}") == (200, b"a scene")
         wrong = ["evil.example", f"evil.example:{port}", "localhost", f"localhost:{port + 1}", f"127.0.0.1:{port}0", ""]
@@ -89,7 +77,7 @@ def test_only_this_machine_by_name_is_answered():
 
 def test_idle_connections_end(monkeypatch):
     monkeypatch.setattr(command, "IDLE_SECONDS", 0.2)
-    with served("x" * (32 << 20)) as port:
+    with served(command.serve("x" * (32 << 20), 0)) as port:
         for said in (b"", b"GET / HTTP/1.1\r\nHost: local"):
             with connect(port) as client:
                 client.sendall(said)
@@ -102,7 +90,7 @@ def test_idle_connections_end(monkeypatch):
 def test_a_slow_connection_gets_the_page(monkeypatch):
     monkeypatch.setattr(command, "IDLE_SECONDS", 0.5)
     # The kernel holds 10 MB of it; the client takes the rest in more seconds than a connection may idle.
-    with served("x" * (24 << 20)) as port, asked(port) as client:
+    with served(command.serve("x" * (24 << 20), 0)) as port, asked(port) as client:
         received = 0
         while part := client.recv(1 << 20, socket.MSG_WAITALL):
             received += len(part)
@@ -111,7 +99,7 @@ def test_a_slow_connection_gets_the_page(monkeypatch):
 
 
 def test_a_browser_that_leaves_causes_no_traceback(capfd):
-    with served("x" * (32 << 20)) as port:
+    with served(command.serve("x" * (32 << 20), 0)) as port:
         with asked(port) as client:
             assert client.recv(1)
             # Close by a reset, as a browser does whose page is left while it loads.

@@ -9,7 +9,6 @@ import dataclasses
 import io
 import json
 import os
-import threading
 from contextlib import contextmanager
 from functools import partial
 from http.server import ThreadingHTTPServer
@@ -19,6 +18,7 @@ import numpy as np
 import pytest
 import torch
 from chromium import CHROMIUM, bench_page, bench_viewers, browser, needs_chromium, needs_packages, touch
+from command_line import served
 from packed_scenes import KINDS, packed_file, write_bomb, write_kind
 from PIL import Image
 
@@ -88,21 +88,18 @@ def click(page, element, stop):
     until(page, f"{STOP} == '{stop}'", stop)
 
 
+def drawn_after(page, act, more=1):
+    """Wait until more images are drawn than at an act."""
+    before = page.evaluate("sundae.frames")
+    act()
+    until(page, f"sundae.frames >= {before + more}", "images")
+
+
 def hold(page, code):
     """Hold a key for two frames."""
-    before = page.evaluate("sundae.frames")
-    page.call("Input.dispatchKeyEvent", {"type": "keyDown", "key": code, "code": code})
-    until(page, f"sundae.frames > {before} + 1", "two frames")
-    page.call("Input.dispatchKeyEvent", {"type": "keyUp", "key": code, "code": code})
-
-
-@contextmanager
-def served(server):
-    """Address of a server."""
-    with server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_port}/"
-        server.shutdown()
+    key = {"key": code, "code": code}
+    drawn_after(page, lambda: page.call("Input.dispatchKeyEvent", {"type": "keyDown", **key}), 2)
+    page.call("Input.dispatchKeyEvent", {"type": "keyUp", **key})
 
 
 @pytest.fixture(scope="module")
@@ -118,16 +115,9 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def site(folder):
     """Address of the folder's site."""
-    with served(
-        ThreadingHTTPServer(("127.0.0.1", 0), partial(bench_viewers.Quiet, directory=folder / "site"))
-    ) as address:
-        yield address
-
-
-@pytest.fixture
-def at(folder):
-    """Address of the folder's page."""
-    return (folder / "a.html").as_uri()
+    quiet = partial(bench_viewers.Quiet, directory=folder / "site")
+    with served(ThreadingHTTPServer(("127.0.0.1", 0), quiet)) as port:
+        yield f"http://127.0.0.1:{port}/"
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -175,31 +165,19 @@ def test_the_head_in_half_precision(name, tmp_path):
 
 def test_the_controls(folder):
     server = serve(page_of(("a", *packed_file(folder / "a.sundae"))), 0)
-    with served(server) as address, opened(address) as page:
-
-        def look():
-            """The canvas once it rests, and the words beside the stop."""
-            return rested(page), page.evaluate(STOP)
+    with served(server) as port, opened(f"http://127.0.0.1:{port}/") as page:
 
         def after(act):
-            """The same after an act, or the click on an element, has changed the canvas."""
-            before = page.evaluate("sundae.frames")
-            page.evaluate(f"document.getElementById('{act}').click()") if isinstance(act, str) else act()
-            until(page, f"sundae.frames > {before}", "a frame")
-            return look()
+            """The canvas once it rests after an act, or the click on an element; and the words beside the stop."""
+            drawn_after(page, (lambda: page.evaluate(f"{act}.click()")) if isinstance(act, str) else act)
+            return rested(page), page.evaluate(STOP)
 
-        first, stop = look()
-        assert stop == "1 of 2"
-        bare, _ = after("head")
-        assert np.abs(bare - first).mean() > 1
-        again, _ = after("head")
-        np.testing.assert_array_equal(again, first)
-        second, stop = after("after")
-        assert stop == "2 of 2"
-        assert np.abs(second - first).mean() > 1
-        again, stop = after("after")
-        assert stop == "1 of 2"
-        np.testing.assert_array_equal(again, first)
+        first = rested(page)
+        assert page.evaluate(STOP) == "1 of 2"
+        for act, stop, same in (("head", 1, False), ("head", 1, True), ("after", 2, False), ("after", 1, True)):
+            found, said = after(act)
+            assert (said, np.array_equal(found, first)) == (f"{stop} of 2", same)
+            assert same or np.abs(found - first).mean() > 1
         turned, stop = after(lambda: page.drag(80, 60, 110, 70))
         assert stop == "free"
         assert np.abs(turned - first).mean() > 1
@@ -217,8 +195,7 @@ def test_the_controls(folder):
         assert np.abs(flown - orbited).mean() > 1
         moved, _ = after(lambda: hold(page, "KeyW"))
         assert np.abs(moved - flown).mean() > 1
-        half = "const s = document.getElementById('scale'); s.value = 50; s.dispatchEvent(new Event('input'))"
-        after(lambda: page.evaluate(f"{{{half}}}"))
+        after(lambda: page.evaluate("{ scale.value = 50; scale.dispatchEvent(new Event('input')) }"))
         assert page.evaluate("document.getElementById('scale-value').textContent") == "50%"
 
 
@@ -231,14 +208,10 @@ def test_the_page_opens_at_the_start_view_and_turns_about_the_up_axis(folder, tm
         scene = dataclasses.replace(plain, up=up, start=start)
         write_page(tmp_path / "a.html", ("a", scene, container.restated(content, stated_start(scene))))
         with opened((tmp_path / "a.html").as_uri(), flags=WEBGL) as page:
-            hidden = "for (const id of ['panel', 'message']) document.getElementById(id).style.visibility = 'hidden'"
-            page.evaluate(f"{{ {hidden}; {TICKING} }}")  # the message of WebGL2 would take the drag
             assert page.evaluate(STOP) == stop
-            shots[name] = [page.screenshot().astype(int)]
-            frames = page.evaluate("sundae.frames")
-            page.drag(80, 60, 110, 70)
-            until(page, f"sundae.frames > {frames}", "a frame")
-            shots[name].append(page.screenshot().astype(int))
+            shots[name] = [rested(page)]
+            drawn_after(page, lambda page=page: page.drag(80, 60, 110, 70))
+            shots[name].append(rested(page))
             if stop == "2 of 2":
                 click(page, "document.getElementById('after')", "1 of 2")
 
@@ -296,9 +269,7 @@ def test_the_head_fades_in_once_the_camera_rests(site):
     with opened(site, before=WEIGHTS) as page:
         rested(page)
         page.evaluate("weights.length = 0")
-        frames = page.evaluate("sundae.frames")
-        page.call("Input.dispatchKeyEvent", {"type": "keyDown", **key})
-        until(page, f"sundae.frames > {frames} + 4", "images of a moving camera")
+        drawn_after(page, lambda: page.call("Input.dispatchKeyEvent", {"type": "keyDown", **key}), 5)
         found = page.evaluate("[sundae.still, weights, document.querySelector('canvas').width]")
         page.call("Input.dispatchKeyEvent", {"type": "keyUp", **key})
         # A software adapter takes longer than a thirtieth of a second.
@@ -319,28 +290,35 @@ def test_the_head_fades_in_once_the_camera_rests(site):
         assert page.evaluate("weights[0]") == 0
 
 
-PINCH = [[(70, 60), (90, 60)], [(60, 60), (100, 60)], [(50, 60), (110, 60)]]
+def spread(page):
+    """Spread two fingers."""
+    for i, reach in enumerate((10, 20, 30)):
+        points = [{"x": 80 + side * reach, "y": 60} for side in (-1, 1)]
+        page.call("Input.dispatchTouchEvent", {"type": "touchMove" if i else "touchStart", "touchPoints": points})
+    page.call("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
 
 
-@pytest.mark.parametrize("drawn", ["webgpu", "webgl"])
-def test_fingers_turn_and_zoom(drawn, site):
+@pytest.mark.parametrize(("flags", "name"), [(browser.WEBGPU, "residual"), (WEBGL, "of millimetres")])
+def test_fingers_turn_and_zoom(flags, name, tmp_path):
+    write_page(tmp_path / "a.html", ("a", *packed_file(write_kind(tmp_path / "a.sundae", KINDS[name]))))
+
     def linked():
         page.evaluate("document.getElementById('link').click()")
         return [float(word) for word in page.evaluate("location.hash").removeprefix("#camera=").split(",")]
 
-    with opened(site, flags=browser.WEBGPU if drawn == "webgpu" else WEBGL) as page:
-        assert page.evaluate("sundae.drawn") == drawn
+    with opened((tmp_path / "a.html").as_uri(), flags=flags) as page:
         rested(page)
         assert linked() == [1]
         touch(page, (80, 60), (110, 60))
         browser.wait_for(lambda: len(linked()) > 1, "the turn", SECONDS)  # frames in software take seconds
-        turned = linked()
-        for i, points in enumerate(PINCH):
-            event = {"type": "touchMove" if i else "touchStart", "touchPoints": [{"x": x, "y": y} for x, y in points]}
-            page.call("Input.dispatchTouchEvent", event)
-        page.call("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+        rested(page)
+        turned, link = linked(), page.evaluate("location.hash")
+        assert np.linalg.norm(turned[:3]) == pytest.approx(1.4 * KINDS[name].side, rel=0.1)
+        drawn_after(page, lambda: spread(page))
         nearer = 0.8 * np.linalg.norm(turned[3:6])
         browser.wait_for(lambda: np.linalg.norm(linked()[3:6]) < nearer, "the zoom", SECONDS)
+        page.evaluate(f"location.hash = '{link}'")
+        browser.wait_for(lambda: linked()[:3] == pytest.approx(turned[:3], rel=1e-3), "the view of the link", SECONDS)
 
 
 def test_the_panel_of_a_phone(site):
@@ -380,10 +358,8 @@ def test_two_scenes_named_views_and_a_path(flags, folder, tmp_path):
         click(page, "views.children[1]", "2 of 2")
         click(page, "views.children[0]", "free")
         rested(page)
-        page.evaluate("play.click()")
-        until(page, "play.textContent == 'Stop'", "the path")
-        frames = page.evaluate("sundae.frames")
-        until(page, f"sundae.frames > {frames} + 4", "frames of the path")
+        drawn_after(page, lambda: page.evaluate("play.click()"), 6)
+        assert page.evaluate("play.textContent") == "Stop"
         page.evaluate("play.click()")
         rested(page)
         assert page.evaluate("[play.textContent, sundae.still]") == ["Play", True]
@@ -518,15 +494,15 @@ def check_base_colours(page, packed):
 
 
 @pytest.mark.parametrize("refusal", ["no WebGPU", *REFUSALS])
-def test_a_gpu_that_fails_at_the_start_leaves_base_colours(refusal, at, folder):
-    with opened(at, before=REFUSALS.get(refusal, ""), flags=browser.WEBGPU if refusal in REFUSALS else WEBGL) as page:
+def test_a_gpu_that_fails_at_the_start_leaves_base_colours(refusal, site, folder):
+    with opened(site, before=REFUSALS.get(refusal, ""), flags=browser.WEBGPU if refusal in REFUSALS else WEBGL) as page:
         assert page.evaluate(SAID).startswith("This browser has no WebGPU") or refusal in REFUSALS
         check_base_colours(page, folder / "a.sundae")
 
 
 @pytest.mark.parametrize("loss", ["the device", "an error of its work", "the GPU process"])
-def test_a_lost_gpu_leaves_camera_and_controls(loss, at, folder):
-    with opened(at, before=DEVICES) as page:
+def test_a_lost_gpu_leaves_camera_and_controls(loss, site, folder):
+    with opened(site, before=DEVICES) as page:
         assert page.evaluate("sundae.drawn") == "webgpu"
         page.evaluate("{ head.click(); scale.value = 80; scale.dispatchEvent(new Event('input')) }")
         rested(page)  # the panel covers so small a page
@@ -549,29 +525,27 @@ def test_a_lost_gpu_leaves_camera_and_controls(loss, at, folder):
         browser.wait_for(lambda: np.abs(rested(page) - seen).mean() > 4, "another view", SECONDS)
 
 
-def test_a_gpu_lost_without_webgl_leaves_the_image(at):
-    with opened(at, before=DEVICES) as page:
+def test_a_gpu_lost_without_webgl_leaves_the_image(site):
+    with opened(site, before=DEVICES) as page:
         page.evaluate(f"{{ {NO_WEBGL} devices[0].destroy() }}")
         until(page, "sundae.state == 'failed'", "the end")
         assert "WebGL2 is missing too" in page.evaluate(SAID)
         assert page.evaluate("[poster.hidden, stage.hidden, panel.hidden]") == [False, True, True]
 
 
-def test_a_lost_webgl_context_is_opened_again(at, folder):
+def test_a_lost_webgl_context_is_opened_again(site, folder):
     lose = "document.querySelector('canvas').getContext('webgl2').getExtension('WEBGL_lose_context').loseContext()"
-    with opened(at, flags=WEBGL) as page:
+    with opened(site, flags=WEBGL) as page:
         for _ in range(2):
-            frames = page.evaluate("sundae.frames")
-            page.evaluate(lose)
-            until(page, f"sundae.frames > {frames}", "a frame")
+            drawn_after(page, lambda: page.evaluate(lose))
             check_base_colours(page, folder / "a.sundae")
         page.evaluate(lose)
         until(page, "sundae.state == 'failed'", "the end")
         assert page.evaluate("[poster.hidden, stage.hidden, panel.hidden]") == [False, True, True]
 
 
-def test_without_webgl_the_page_shows_an_image(at):
+def test_without_webgl_the_page_shows_an_image(site):
     flags = ["--disable-features=WebGPU", "--disable-3d-apis"]
-    with opened(at, state="failed", flags=flags) as page:
+    with opened(site, state="failed", flags=flags) as page:
         assert "no WebGPU, and WebGL2 is missing too" in page.evaluate(SAID)
         assert page.evaluate("[poster.hidden, poster.naturalWidth, poster.naturalHeight]") == [False, 50, 37]

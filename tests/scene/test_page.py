@@ -148,6 +148,7 @@ def test_the_decoder_agrees_with_python(decode, files):
         assert found["count"] == len(truth.gaussians["means"])
         stated = (found["degree"], found["logits"], found["antialiased"])
         assert stated == (kind.degree, kind.degree == 0, kind.antialiased)
+        assert found["extent"] == pytest.approx(sn.load(file).extent)
         for name, value in {**truth.gaussians, **truth.head}.items():
             array = np.fromfile(f"{file}.{name}", np.float32)
             # Sums of the transform and lengths of quaternions round in another order.
@@ -259,7 +260,8 @@ def test_the_page_counts_fragments_before_it_draws(files, tmp_path):
         reach = reach * splats.covars2d[:, [0, 2]].sqrt()
         low = (splats.means2d - reach).clamp(min=0)
         high = torch.minimum(splats.means2d + reach, torch.tensor((camera.width, camera.height)))
-        areas = (high - low).clamp(min=0).prod(dim=1) * ((splats.depths >= 0.01) & (opacities >= 1 / 255))
+        visible = (splats.depths >= scene.settings().near_plane) & (opacities >= 1 / 255)
+        areas = (high - low).clamp(min=0).prod(dim=1) * visible
         assert counted["fragments"] == pytest.approx(float(areas.double().sum()), rel=1e-3)
         assert counted["bound"] >= counted["fragments"]
         assert (counted["fragments"] > 256 * counted["most"]) == (file == files[-1])

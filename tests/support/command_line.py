@@ -1,6 +1,11 @@
-"""``sundae`` in this process."""
+"""``sundae`` in this process, and servers beside it."""
 
 from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import ThreadingHTTPServer
 
 import pytest
 
@@ -21,3 +26,14 @@ def refusal(capsys: pytest.CaptureFixture[str], *words: object) -> str:
     (line,) = [line for line in capsys.readouterr().err.strip().splitlines() if "compiling the CPU" not in line]
     assert line.startswith("sundae: ")
     return line
+
+
+@contextmanager
+def served(server: ThreadingHTTPServer) -> Iterator[int]:
+    """The port of a server of this machine, which runs."""
+    with server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        host, port = server.server_address[:2]
+        assert host == "127.0.0.1"
+        yield port
+        server.shutdown()

@@ -34,6 +34,7 @@ class Kind:
     """What a scene differs in."""
 
     points: int = 400
+    side: float = 1.0  # Of the cube, world units; another one is not in nerfstudio's frame
     degree: int = 3
     antialiased: bool = False
     background: Background = "random"
@@ -59,6 +60,7 @@ KINDS = {
     "trained at a smaller scale": Kind(degree=1, head=_head("residual", 1, 4), focal=0.6 * FOCAL),
     # More than one workgroup sorts, and the lists of tiles outgrow their first buffers.
     "many Gaussians": Kind(points=20_000, degree=0, head=_head("residual", 1, 1)),
+    "of millimetres": Kind(degree=1, side=1e-3),
     "other precisions": Kind(
         head=_head("residual", 1, 6),
         # Steps in the order of STEPS.
@@ -71,7 +73,7 @@ def write_kind(path: Path, kind: Kind) -> Path:
     """Write a packed scene of a kind, with two cameras."""
     torch.manual_seed(0)
     n = kind.points
-    points = torch.rand(n, 3) - 0.5
+    points = kind.side * (torch.rand(n, 3) - 0.5)
     features = kind.head.num_features if kind.head else 3
     gaussians = from_points(points, torch.rand(n, 3), sh_degree=kind.degree)
     gaussians["features"] = initial_features(gaussians["features_dc"], features)
@@ -91,9 +93,10 @@ def write_kind(path: Path, kind: Kind) -> Path:
             head.net.out.weight.data = 0.3 * torch.randn_like(head.net.out.weight)
     focal = (kind.focal, kind.focal) if kind.head and kind.focal else None
     encoded = Gaussians(gaussians, "harmonics" if kind.degree else "logits")
-    packed = contents_of(Scene(encoded, head, kind.background, kind.antialiased, focal, in_model_frame=True))
+    scene = Scene(encoded, head, kind.background, kind.antialiased, focal, in_model_frame=kind.side == 1)
+    packed = contents_of(scene)
     sensitivity = _sensitivity(gaussians, packed.head) if kind.measured else Sensitivity({}, {})
-    write_fitted(path, *fit_scene(replace(packed, cameras=_cameras(), sensitivity=sensitivity), kind.config))
+    write_fitted(path, *fit_scene(replace(packed, cameras=_cameras(kind.side), sensitivity=sensitivity), kind.config))
     return path
 
 
@@ -130,12 +133,13 @@ def _sensitivity(gaussians: Mapping[str, Tensor], head: Mapping[str, Tensor]) ->
     )
 
 
-def _cameras() -> dict[str, Tensor]:
+def _cameras(side: float) -> dict[str, Tensor]:
     turn = torch.linalg.qr(torch.eye(3) + 0.1 * torch.randn(3, 3)).Q
     turn = turn * turn.diagonal().sign()
     poses = torch.stack([torch.cat([turn, 1.4 * turn[:, 2:]], dim=1), torch.eye(4)[:3]])
     # The second camera is close: Gaussians are behind it, beside it and across the whole image.
     poses[1, :, 3] = torch.tensor([0.1, 0.0, 0.55])
+    poses[:, :, 3] *= side
     lens = torch.tensor([FOCAL, FOCAL + 1, 24.0, 19.5]).double()
     return {"poses": poses, "intrinsics": lens.repeat(2, 1), "sizes": torch.tensor([[WIDTH, HEIGHT]]).repeat(2, 1)}
 

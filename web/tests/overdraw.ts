@@ -6,11 +6,13 @@ import { readFileSync } from "node:fs";
 import { geometryOf } from "../src/arrays";
 import { mostPairs } from "../src/limits";
 import { readScene } from "../src/scene/scene";
+import { enlarged, unitOf } from "../src/scene/size";
 import { viewOf } from "../src/view";
 import { boundOf, extentsOf, fragmentsOf } from "../src/webgl/overdraw";
 
 for (const file of process.argv.slice(2)) {
-  const scene = await readScene(new Uint8Array(readFileSync(file)));
+  const found = await readScene(new Uint8Array(readFileSync(file)));
+  const scene = enlarged(found, unitOf(found));
   const [geometry, view] = [geometryOf(scene), viewOf(scene.cameras[0]!)];
   const bound = boundOf(geometry, extentsOf(geometry), view);
   const most = mostPairs((view.width * view.height) / 256, scene.field.count);

@@ -4,6 +4,7 @@ import { decode } from "../decoding";
 import type { Times } from "../drawer";
 import { PackError } from "../scene/container";
 import type { Scene } from "../scene/scene";
+import { enlarged, unitOf } from "../scene/size";
 import { viewOf, zoomed } from "../view";
 import { onThisDevice } from "./budget";
 import { connect, type Elements, elements, write } from "./controls";
@@ -130,13 +131,15 @@ function halves(page: Elements, names: string[]): HTMLElement[] {
 
 /** Shows the scenes by one camera, until `fail` is called. */
 async function show(
-  scenes: Scene[],
+  given: Scene[],
   names: string[],
   page: Elements,
   handle: Handle,
   fail: (error: unknown) => void,
 ): Promise<void> {
-  const navigation = new Navigation(scenes[0]!, page.stage);
+  const unit = Math.min(...given.map(unitOf));
+  const scenes = given.map((scene) => enlarged(scene, unit));
+  const navigation = new Navigation(scenes[0]!, page.stage, unit);
   const wanted = () => ({ scale: Number(page.scale.value) / 100, head: page.head.checked });
   const places = halves(page, names);
   const stages = scenes.map((scene, i) => new Stage(scene, places[i]!, () => loops[i]!.mark()));

@@ -13,6 +13,12 @@ const LARGEST = 1e9;
 const SMALLEST = 1e-9;
 const DIGITS = 7;
 
+/** The place with lengths times a factor. */
+export function resized({ position, ahead, lens }: Place, factor: number): Place {
+  const times = (vector: number[]) => vector.map((value) => value * factor) as Place["ahead"];
+  return { position: times(position), ahead: times(ahead), lens };
+}
+
 /** The part of an address for a stop, or for any other place. */
 export const linkTo = (stop: number | null, { position, ahead, lens }: Place): string =>
   `#camera=${stop === null ? [...position, ...ahead].map((n) => Number(n.toPrecision(DIGITS))).concat(lens + 1) : stop + 1}`;

@@ -3,8 +3,9 @@
 import { Matrix4, PerspectiveCamera, Vector3 } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import type { Camera, Scene } from "../scene/scene";
+import { middleOf, reachOf } from "../scene/size";
 import { type View, viewOf } from "../view";
-import { linked, linkTo, type Place } from "./link";
+import { linked, linkTo, type Place, resized } from "./link";
 
 /** Keys that move the camera, by its own axes: right, up, backwards. */
 const MOVES: Record<string, [number, number, number]> = {
@@ -33,33 +34,14 @@ const DEFAULT_FOV = 50;
 const LEG = 4;
 const MOST_PLACES = 8;
 
-const median = (values: number[]): number => values.sort((a, b) => a - b)[values.length >> 1] ?? 0;
-
-/** The middle of the primitives. */
-function middleOf({ field }: Scene): Vector3 {
-  // A sample of the primitives is enough for a median.
-  const stride = Math.max(Math.floor(field.count / 5000), 1);
-  const along = (axis: number): number => {
-    const values: number[] = [];
-    for (let i = 0; i < field.count; i += stride) values.push(field.means[3 * i + axis]!);
-    return median(values);
-  };
-  return new Vector3(along(0), along(1), along(2));
-}
-
 /** A camera in front of a scene without cameras and start view: with z upwards it looks along y. */
 function outside(scene: Scene, middle: Vector3): Camera {
-  const distances: number[] = [];
-  const place = new Vector3();
-  for (let i = 0; i < scene.field.count; i++)
-    distances.push(place.fromArray(scene.field.means, 3 * i).distanceTo(middle));
-  const away = 3 * Math.max(median(distances), 1e-6);
   const up = new Vector3(...(scene.up ?? [0, 0, 1])).normalize();
   const side = new Vector3(...(Math.abs(up.x) < 0.9 ? [1, 0, 0] : [0, 1, 0]));
   const back = side.cross(up).normalize();
   const pose = new Matrix4()
     .makeBasis(up.clone().cross(back), up, back)
-    .setPosition(back.multiplyScalar(away).add(middle));
+    .setPosition(back.multiplyScalar(3 * reachOf(scene)).add(middle));
   return { pose: pose.transpose().elements.slice(0, 12), fx: 500, fy: 500, cx: 320, cy: 240, width: 640, height: 480 };
 }
 
@@ -89,9 +71,14 @@ export class Navigation {
 
   /**
    * @param element - takes mouse and touch
+   * @param unit - world units in one unit of the scene; links have world units
    */
-  constructor(scene: Scene, element: HTMLElement) {
-    this.middle = middleOf(scene);
+  constructor(
+    scene: Scene,
+    element: HTMLElement,
+    private readonly unit: number,
+  ) {
+    this.middle = new Vector3(...middleOf(scene));
     this.stops = scene.cameras.length ? scene.cameras : [scene.start ?? outside(scene, this.middle)];
     this.lens = this.stops[0]!;
     this.camera.up.copy(scene.up ? new Vector3(...scene.up).normalize() : this.up());
@@ -134,12 +121,19 @@ export class Navigation {
   link(): string {
     const { position } = this.camera;
     const ahead = this.controls.target.clone().sub(position);
-    return linkTo(this.stop, { position: position.toArray(), ahead: ahead.toArray(), lens: this.visited });
+    const place = { position: position.toArray(), ahead: ahead.toArray(), lens: this.visited };
+    return linkTo(this.stop, resized(place, this.unit));
+  }
+
+  /** The stop or the place that a part of an address names; null for none. */
+  private linked(hash: string): number | Place | null {
+    const found = linked(hash, this.stops.length);
+    return typeof found === "object" && found ? resized(found, 1 / this.unit) : found;
   }
 
   /** Goes to the view that a part of an address names; stays where it names none. */
   follow(hash: string): void {
-    const found = linked(hash, this.stops.length);
+    const found = this.linked(hash);
     if (found === null) return;
     if (typeof found === "number") {
       this.visit(found);
@@ -171,7 +165,7 @@ export class Navigation {
       this.onChange();
       return;
     }
-    const named = links.map((hash) => linked(hash, this.stops.length)).filter((found) => found !== null);
+    const named = links.map((hash) => this.linked(hash)).filter((found) => found !== null);
     const places = named.map((found) => (typeof found === "number" ? this.placeOf(found) : found));
     this.path = places.length > 1 ? places : this.stops.length > 2 ? this.tour() : this.circle();
     this.played = 0;

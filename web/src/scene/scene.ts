@@ -6,6 +6,7 @@ import { gaps, levels, neighboursOf } from "./entropy";
 import { type Head, readHead, type StatedHead } from "./head";
 import { type Numbers, Reader } from "./reader";
 import { violation } from "./schema";
+import { reachOf } from "./size";
 
 export type Floats = Float32Array<ArrayBuffer>;
 
@@ -29,6 +30,8 @@ export type Scene = {
   field: Field;
   /** Gaussians of the file; a phone draws fewer. */
   total: number;
+  /** Median distance of the primitives from their middle, world units; 1 in nerfstudio's model. */
+  extent: number;
   /** Length of a feature vector; 0 without features. */
   features: number;
   /** SH degree of the stored colours. */
@@ -60,7 +63,7 @@ export async function readScene(file: Uint8Array<ArrayBuffer>, onProgress: OnPro
   const header = await readHeader(file);
   const wrong = violation(header.meta, "header") ?? violation(header.meta.model, "model", "model");
   if (wrong !== null) throw damaged(`its header has no valid ${wrong}`);
-  const { primitives, attributes, model: stated, up = null, start = null } = header.meta as unknown as Stated;
+  const { primitives, attributes, model: stated, up = null, start = null, source } = header.meta as unknown as Stated;
   const width = (name: string): number => attributes[name]?.width ?? 0;
   const shape = { count: primitives, rest: width("features_rest"), features: width("features") };
   checkRatio(4 * shape.count * (14 + shape.rest + shape.features), file.length);
@@ -75,6 +78,7 @@ export async function readScene(file: Uint8Array<ArrayBuffer>, onProgress: OnPro
   return {
     field,
     total: field.count,
+    extent: source?.model_frame === false ? reachOf({ field }) : 1,
     features: shape.features,
     degree,
     logits: stated.sh_degree === 0,
@@ -101,6 +105,7 @@ type Stated = {
     head?: StatedHead | null;
     trained_focal?: [number, number] | null;
   };
+  source?: { model_frame?: boolean };
   up?: number[];
   start?: { pose: number[][]; intrinsics: number[]; size: number[] };
 };
