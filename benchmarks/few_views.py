@@ -21,10 +21,11 @@ import tyro
 from nerfstudio.data.utils import colmap_parsing_utils as colmap
 from suite import SuiteOptions, run_suite
 
+from harness.arms import choose_arms
 from harness.plan import parser_of
 from harness.rows import Rows, read_rows
 from harness.run import run_script
-from sundae_ns.core.errors import DataError, reading, writing
+from sundae_ns.core.errors import ConfigError, DataError, reading, writing
 from sundae_ns.data.reconstruct import pycolmap
 
 COLUMNS = ("capture", "views", "seed", "arm", "primitives", "head", "psnr", "ssim")
@@ -70,13 +71,9 @@ def triangulated(cameras: Mapping[int, Any], images: Mapping[int, Any], folder: 
         with module.Database.open(path) as database:
             for camera in model.cameras.values():
                 camera.has_prior_focal_length = True
-                database.write_camera(camera, use_camera_id=True)
-            for rig in model.rigs.values():
-                database.write_rig(rig, use_rig_id=True)
-            for frame in model.frames.values():
-                database.write_frame(frame, use_frame_id=True)
-            for image in model.images.values():
-                database.write_image(image, use_image_id=True)
+            for kind in ("camera", "rig", "frame", "image"):
+                for each in getattr(model, f"{kind}s").values():
+                    getattr(database, f"write_{kind}")(each, **{f"use_{kind}_id": True})
         module.extract_features(path, folder, [image.name for image in images.values()])
         verification = module.TwoViewGeometryOptions()
         verification.ransac.random_seed = 0  # the same points on any number of threads
@@ -118,14 +115,18 @@ def main(
         table: table of results, in which rows take the place of earlier ones; by default they are only printed.
     """
     cuts = {f"{path.resolve().name}-{count}": (path.resolve(), count) for path in captures for count in views}
+    if len(cuts) < len(captures) * len(views):
+        raise ConfigError("two captures or numbers of views are named alike; rename one, or give each once")
     folder = out / "captures"
+    options = SuiteOptions(folder=folder, out=out / "suite", arms=arms, seeds=seeds, scenes=tuple(cuts))
+    choose_arms(options.arms, options.method, options.steps_scale, from_scratch=True)  # refused before minutes of cuts
     with writing(f"cannot make {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
     for name, (capture, count) in cuts.items():
         if not (folder / name).exists():
             cut(capture, count, folder / name)
-    code = run_suite(SuiteOptions(folder=folder, out=out / "suite", arms=arms, seeds=seeds, scenes=tuple(cuts)))
-    record(out / "suite", table)
+    code = run_suite(options)
+    record(options.out, table)
     return code
 
 

@@ -10,7 +10,7 @@ from few_views import colmap
 
 from harness.plan import parser_of
 from harness.rows import read_rows
-from sundae_ns.core.errors import DataError
+from sundae_ns.core.errors import ConfigError, DataError
 
 
 @pytest.mark.parametrize("tests", [range(0, 20, 8), (3, 4, 12)])
@@ -52,6 +52,10 @@ def test_rows_of_a_suite_replace_those_of_the_same_cut_seed_and_arm(tmp_path, mo
     table = tmp_path / "few.csv"
     for views, arms in (((12, 16), ("splatfacto",)), ((12,), ("splatfacto", "sundae-auto"))):
         assert few_views.main((tmp_path / "fox",), out=tmp_path, views=views, arms=arms, table=table) == 1
+    for captures, arms in ((("fox", "other/fox"), ("splatfacto",)), (("dog",), ("splatfakto",))):
+        with pytest.raises(ConfigError, match="two captures .* are named alike|splatfakto is no arm"):
+            few_views.main(tuple(tmp_path / name for name in captures), out=tmp_path, arms=arms, table=table)
+    assert {path.name for path in (tmp_path / "captures").iterdir()} == {"fox-12", "fox-16"}
     found = [(row["capture"], row["views"], row["arm"], row["head"], row["psnr"]) for row in read_rows(table)]
     places = [("16", "splatfacto"), ("12", "splatfacto"), ("12", "default")]
     assert found == [("fox", *place, "off", "30.123") for place in places]
