@@ -71,12 +71,10 @@ class Distillation:
         keep = 0.1 if keep is None and count is None else keep
         # Its own head, if it has one, corrects its images.
         teacher = dataclasses.replace(scene, gaussians=sanitise(scene.gaussians).gaussians)
-        if cameras is not None:
-            trained, held_out = split(usable_cameras(cameras))
-            trained = trained or held_out
-        else:
-            trained = virtual_cameras(teacher, CAMERAS, seed=seed, size=size)
-            held_out = virtual_cameras(teacher, HELD_OUT, seed=seed + 1, size=size)
+        given = () if cameras is None else usable_cameras(cameras)
+        trained, held_out = split(given)
+        trained = trained or held_out or virtual_cameras(teacher, CAMERAS, seed=seed, size=size)
+        held_out = held_out or virtual_cameras(teacher, HELD_OUT, seed=seed + 1, size=size)
         self._teacher, scaled, self._size = of_unit_size(teacher, [*trained, *held_out])
         self.cameras, self.held_out = scaled[: len(trained)], scaled[len(trained) :][:HELD_OUT]
         self.steps, self._seed = steps, seed  # Number of steps to train
@@ -85,8 +83,10 @@ class Distillation:
         tiny = {"size": "tiny", "pixel_unshuffle": 1, "num_features": 5} if teacher.device.type == "cpu" else {}
         self.state = self._start(cut.scene.gaussians, HeadConfig(mode="residual", **cast(Any, tiny)) if head else None)
         counts = [self._teacher.num_gaussians, self.state.gaussians.num_gaussians, len(self.cameras)]
-        of_scene = crc32(scene.gaussians["means"].detach().cpu().numpy().tobytes())
-        self._options = {"steps": steps, "seed": seed, "counts": counts, "scene": of_scene}  # As a resumed one has them
+        seen = [scene.means, *(matrix for camera in given for matrix in camera[:2])]
+        checksum = crc32(b"".join(matrix.detach().cpu().numpy().tobytes() for matrix in seen))
+        # As a resumed one has them
+        self._options = {"steps": steps, "seed": seed, "head": head, "counts": counts, "scene": checksum}
         self.step = 0  # Number of steps that were trained
         self.gain: float | None = None  # PSNR that the head gained in its trial, dB; None before it, and without one
         self._mean = RunningMean()
@@ -245,7 +245,7 @@ class Distillation:
         with reading(path, "a checkpoint of this scene and options", CheckpointError, remedy="remove it to start anew"):
             saved = torch.load(path, map_location=state.device, weights_only=True)
             if saved["options"] != self._options:
-                raise ValueError("other options or another scene")
+                raise ValueError("other cameras, options or another scene")
             self.step = int(saved["step"])
             self.gain = saved["gain"]
             if not any(name.startswith("networks.") for name in saved["model"]):
@@ -254,8 +254,7 @@ class Distillation:
             for name, optimizer in state.optimizers.items():
                 optimizer.load_state_dict(saved["optimizers"][name])
             self._mean = RunningMean.of(saved["mean"], state.device)
-        if state.head is not None:
-            state.head_starts_at = -math.inf
+        state.head_starts_at = -math.inf
 
 
 def distill(

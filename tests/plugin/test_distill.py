@@ -55,8 +55,8 @@ def test_a_head_is_kept_where_it_pays_and_a_resumed_training_ends_alike(pays, ba
     for name in ("LEAST_GAIN", "GAIN_PER_DOUBLING"):
         monkeypatch.setattr(f"sundae_ns.train.choice.{name}", -1000.0 if pays else 1000.0)
 
-    def begun(keep=0.1, scene=ball):
-        return Distillation(scene, keep=keep, cameras=cameras, steps=20)
+    def begun(**other):
+        return Distillation(**{"scene": ball, "keep": 0.1, "cameras": cameras, "steps": 20, **other})
 
     whole, first, second = begun(), begun(), begun()
     assert whole.train(lambda *_: True)
@@ -74,9 +74,10 @@ def test_a_head_is_kept_where_it_pays_and_a_resumed_training_ends_alike(pays, ba
     assert second.train(lambda *_: True)
     for name, value in result.gaussians.items():
         assert torch.equal(value, second.result().gaussians[name]), name
-    for other in (begun(keep=0.2), begun(scene=sn.transform(ball, scale=1.1))):
-        with pytest.raises(CheckpointError, match="of this scene and options .other options or .*; remove it"):
-            other.load(tmp_path / "partial")
+    moved = sn.transform(ball, scale=1.1)
+    for other in ({"keep": 0.2}, {"scene": moved}, {"cameras": cameras[::-1]}, {"head": False}):
+        with pytest.raises(CheckpointError, match="of this scene and options .other cameras, options or .*; remove it"):
+            begun(**other).load(tmp_path / "partial")
     (tmp_path / "partial").write_bytes(b"nothing")
     with pytest.raises(CheckpointError, match="partial is not a checkpoint"):
         begun().load(tmp_path / "partial")
