@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import html
+import logging
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -31,11 +32,12 @@ from sundae_ns.scene.describe import bytes_at, held_out_cameras
 from sundae_ns.scene.frames import FrameReplay
 from sundae_ns.scene.load_save import load
 from sundae_ns.scene.render import GaussianSource, RenderSettings, compensate, draw, scale_plan
-from sundae_ns.scene.scene import Scene, render
+from sundae_ns.scene.scene import Scene, middle_and_reach, render, usable
 
 if TYPE_CHECKING:
     from sundae_ns.plugin.finished_runs import Opened
 
+_log = logging.getLogger(__name__)
 HEAD_ON, HEAD_OFF = "head on", "head off"
 # In the order of a table's columns, with their number of decimals.
 METRICS = (("psnr", 2), ("ssim", 4), ("psnr_fitted", 2), ("lpips", 4))
@@ -93,11 +95,6 @@ class Measured:
     command: str = ""
 
     @property
-    def bytes_total(self) -> int:
-        """Bytes of Gaussians and head."""
-        return self.bytes_primitives + self.bytes_head
-
-    @property
     def full(self) -> Configuration:
         """The complete rendering: with the head, if the scene has one."""
         return self.configurations[0]
@@ -115,7 +112,7 @@ class Measured:
     def as_json(self) -> dict[str, Any]:
         """All measurements, including those of each view, as plain values for JSON."""
         plain = asdict(self)
-        plain["bytes_total"] = self.bytes_total
+        plain["bytes_total"] = self.full.bytes
         for configuration, entry in zip(self.configurations, plain["configurations"], strict=True):
             entry["mean"] = {metric.name: configuration.mean(metric.name) for metric in fields(ViewQuality)}
         return without_nan(plain)
@@ -202,6 +199,10 @@ def against_first(path: Path, reference: Scene, cameras: Sequence[Camera]) -> Ca
         if other == path:
             return Subject.of_file(reference, path, path.name, [])
         scene = replace(aligned(load(other), reference), background_color=reference.background_color)
+        (middle, reach), (there, size) = (middle_and_reach(usable(each)) for each in (reference, scene))
+        if (away := float((there - middle).norm())) > max(reach, size) or not 0.5 <= size / reach <= 2:
+            found = f"{other} is {size / reach:.3g} times as large as {path}, and its middle is {away:.3g} away"
+            _log.warning("%s; if it was moved or scaled, undo that by sundae_ns.transform", found)
         return Subject.of_file(scene.to(reference.device), other, path.name, views)
 
     return subject

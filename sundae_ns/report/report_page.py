@@ -78,8 +78,7 @@ def error_map(rendering: Tensor, truth: Tensor, size: tuple[int, int] | None = N
     """
     check_pair(rendering, truth)
     image = Image.fromarray((_plain(rendering) - _plain(truth)).abs().mean(dim=-1).numpy())
-    if size is not None and size != image.size:
-        image = image.resize(size, Image.Resampling.BOX)
+    image = image.resize(size or image.size, Image.Resampling.BOX)
     last = len(ERROR_COLORS) - 1
     ranks = np.asarray(image) * (255 / LARGEST_ERROR * last)
     mapped = Image.fromarray(np.round(ranks.clip(0, last)).astype(np.uint8))
@@ -116,8 +115,8 @@ def _plain(image: Tensor) -> Tensor:
 
 
 def _image(image: Tensor, size: tuple[int, int]) -> Image.Image:
-    converted = Image.fromarray((255 * _plain(image)).round().to(torch.uint8).numpy())
-    return converted if converted.size == size else converted.resize(size, Image.Resampling.LANCZOS)
+    whole = Image.fromarray((255 * _plain(image)).round().to(torch.uint8).numpy())
+    return whole.resize(size, Image.Resampling.LANCZOS)
 
 
 def _encoded(image: Image.Image) -> str:

@@ -33,7 +33,7 @@ def rows_of(text):
     return [dict(zip(lines[0], row, strict=True)) for row in lines[2:]]
 
 
-def test_files_are_compared_with_the_first_one(folder, tmp_path, capsys):
+def test_files_are_compared_with_the_first_one(folder, tmp_path, capsys, caplog):
     words = (folder / "whole.sundae", folder / "whole.ply", folder / "half.ply")
     assert run("compare", *words, "-o", tmp_path / "out", "--min-psnr", 99) == 1
     said = capsys.readouterr()
@@ -50,6 +50,12 @@ def test_files_are_compared_with_the_first_one(folder, tmp_path, capsys):
     assert page.count("<article") == 2 * len(cameras)
     assert 'aria-hidden="true">whole.sundae</span>' in page
     assert run("compare", *words, "--cameras", folder / "whole.sundae", "--num-cameras", 1, "--min-psnr", 5) == 0
+    assert "scaled" not in caplog.text
+    moves = {"1 times .* 9 away; if it was moved or scaled": {"translation": (0, 9, 0)}, "3 times": {"scale": 3}}
+    for told, change in moves.items():
+        sn.save(sn.transform(scenes[1], **change), tmp_path / "other.ply")
+        assert run("compare", words[1], tmp_path / "other.ply") == 0
+        assert re.search(f"other.ply is {told}", caplog.messages[-1])
 
 
 def test_formats_of_one_scene_are_one_table(folder, tmp_path, capsys, monkeypatch):

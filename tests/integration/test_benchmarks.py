@@ -98,7 +98,7 @@ def test_a_comparison_that_was_stopped_is_continued(tiny, tmp_path, monkeypatch,
         packed, key = results[arm]["packed"], results[arm]["job"]["key"]
         scene = load_model(out / "jobs" / key / "scene.sundae", data=tiny.scene)
         found = measure(Subject.of_run(scene), repeats=0)
-        assert packed["bytes"] == scene.packed_bytes == found.bytes_total
+        assert packed["bytes"] == scene.packed_bytes == found.full.bytes
         for name, way in (("psnr", found.full), ("psnr_base", found.base)):
             assert packed[name] == pytest.approx(way.mean("psnr"))
         assert packed["bytes"] < 0.7 * results[arm]["measured"]["bytes_total"]
