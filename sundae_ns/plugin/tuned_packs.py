@@ -45,7 +45,7 @@ RATES |= {"quats": 2e-4, "features": 5e-4, "head": 2e-4}
 training they hardly move."""
 Tuned = tuple[PackedScene, Codecs]
 JUDGED, BISECTIONS = 8, 7  # Most test views on which a pack is measured, and packs between the limits of a search
-RATE = 0.025  # Loss for each bit per stored number: about what a bit less costs in quality at the steps of FINETUNED
+LOSS_PER_BIT = 0.025  # Per stored number: about what a bit less costs in quality at the steps of FINETUNED
 
 
 @usual_defaults()
@@ -123,7 +123,7 @@ class RoundedTraining:
         self.head = dict(model.head.named_parameters()) if head and model.head is not None else {}
         self.rounded = {name: model.gauss_params[name] for name in codecs.gaussians} | self.head
         self.exact = {name: value.detach().clone().requires_grad_() for name, value in self.rounded.items()}
-        self._rate = RATE / sum(value.numel() for value in self.exact.values())
+        self._loss_per_bit = LOSS_PER_BIT / sum(value.numel() for value in self.exact.values())
         groups: list[dict[str, Any]] = [
             {"params": [self.exact[name]], "lr": RATES[name], "eps": 1e-15} for name in codecs.gaussians
         ]
@@ -155,7 +155,7 @@ class RoundedTraining:
         loss, _, result = training_step(model.source, model.state, model.losses, inputs, settings)
         gradients = torch.autograd.grad(loss, list(self.rounded.values()), allow_unused=True)
         with torch.enable_grad():
-            total = self._rate * torch.stack(list(estimated_bits(self._codecs, gaussians, head).values())).sum()
+            total = self._loss_per_bit * torch.stack(list(estimated_bits(self._codecs, gaussians, head).values())).sum()
         of_rate = torch.autograd.grad(total, list(self.exact.values()), allow_unused=True)
         for name, gradient, second in zip(self.exact, gradients, of_rate, strict=True):
             self.set_gradient(name, gradient, second)

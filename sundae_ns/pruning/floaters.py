@@ -19,7 +19,7 @@ NEAREST = 0.01  # Share of the sparse points that may be nearer to a camera than
 FREE = 2 / 3  # share of that distance which is taken to be empty
 SUPPORT, REACH = 3, 0.5  # Something near has as many sparse points within this share of the empty distance
 STRENGTH = 0.25  # Default strength of a cleaning, from 0 to 1
-MOST = 0.05  # Largest share that can be floaters; with more of them the points do not say where the scene is
+MOST_FLOATERS = 0.05  # Largest share that can be floaters; with more of them the points do not say where the scene is
 
 
 def _distances(points: Tensor, others: Tensor, nth: int = 1) -> Tensor:
@@ -75,7 +75,7 @@ def floater_odds(gaussians: Gaussians) -> Tensor:
     ball += 1.2 * gap + wide_gap - 1.9 * away.clamp_min(0) + 3 * (1 - 5 * opacities).clamp_min(0)  # haze
     first = torch.where(long - middle > math.log(10), 14 * unlike + 2 * larger - 7.5, ball)
     first -= 5 * (long + math.log(2)).clamp_min(0)  # Gaussians larger than half the scene are its background
-    first -= 1.5 * first.kthvalue(math.ceil((1 - MOST) * n)).values.clamp_min(0)  # sparse points are all alone
+    first -= 1.5 * first.kthvalue(math.ceil((1 - MOST_FLOATERS) * n)).values.clamp_min(0)  # sparse points are all alone
     odds = 1.3 * first + 1.9 * long - 2.2 * away + 1.7 * wide_gap + 0.33 * (long - middle) + 0.4
     for rows in (first > 0).nonzero()[:, 0].split(1 << 16):
         others = near.indices[rows]

@@ -35,7 +35,7 @@ LEAST_PHOTOS = 32  # The neighbours of fewer photos are too far apart
 MEASURED_EVERY = 2  # Steps between two measurements, which launch some ten small kernels
 REFRESHED_EVERY = 200  # Steps between two updates, which wait for the GPU
 NEWEST_WEIGHT = 0.3  # Weight of a new measurement in the mean of a photo
-MOST = 4.0  # Largest measured factor between a photo and its image
+LARGEST_FACTOR = 4.0  # Largest measured factor between a photo and its image
 CLIPPED = 0.98  # Pixels of a photo from this value on may be clipped, and are not measured
 SAMPLE = 1 << 14  # Approximate number of measured pixels of an image
 
@@ -131,7 +131,7 @@ class ExposureCompensation(Callback):
         assert self._smoother is not None
         products, squares = sums[:, 0], sums[:, 1]
         valid = np.isfinite(sums).all(axis=(1, 2)) & (products > 0).all(axis=1) & (squares > 0).all(axis=1)
-        ratio = np.log(products[valid] / squares[valid]).clip(-np.log(MOST), np.log(MOST))
+        ratio = np.log(products[valid] / squares[valid]).clip(-np.log(LARGEST_FACTOR), np.log(LARGEST_FACTOR))
         weight = np.maximum(1 / (self._counts[valid] + 1), NEWEST_WEIGHT)[:, None]
         self._measured[valid] += weight * (ratio - self._measured[valid])
         self._counts[valid] += 1

@@ -25,7 +25,7 @@ CORRELATION = 0.6  # Least correlation with one of the views
 NEIGHBORS = 3  # Views that a view is compared with; the best one counts at a pixel, as often only one sees it
 CONFIRMING = 24  # Number of best neighbours whose depths may confirm those of a view
 JUDGES = 5000  # Most sparse points, evenly drawn, that decide which views are neighbours
-STEP, FEWEST, MOST = 1.5, 16, 256
+PLANE_STEP, FEWEST_PLANES, MOST_PLANES = 1.5, 16, 256
 """Distance of two planes in another view, pixels of the reduced image, and the limits of the number of planes."""
 NEARER, FARTHER = 0.7, 4.0
 """Range of the depths, as shares of those of the nearest and farthest sparse points (without 2% on either side)."""
@@ -207,7 +207,7 @@ def _number_of_planes(photo: _Reduced, others: Sequence[_Reduced], normal: Tenso
         x, y, z = _project(other.camera, points)
         if (z > 0).all():
             longest = max(longest, float(torch.hypot(x[1] - x[0], y[1] - y[0])))
-    return int(min(max(longest / STEP, FEWEST), MOST))
+    return int(min(max(longest / PLANE_STEP, FEWEST_PLANES), MOST_PLANES))
 
 
 def _correlations(

@@ -23,7 +23,7 @@ from sundae_ns.core.tables import without_nan
 from sundae_ns.core.timing import now, peak_memory
 from sundae_ns.io.run_folder import PRUNES, prunes_before
 from sundae_ns.pruning.decision import Pruner
-from sundae_ns.pruning.floaters import MOST, near_cameras
+from sundae_ns.pruning.floaters import MOST_FLOATERS, near_cameras
 from sundae_ns.pruning.rule import PruneRule, ScoreName, kept_count
 from sundae_ns.train.schedules import notify_pruned
 from sundae_ns.train.state import Callback, TrainingRun, TrainingState
@@ -338,5 +338,5 @@ class FloaterRemoval(Callback):
             return
         self._points = None
         eyes = torch.stack([camera.center for camera, _ in run.training_views()])
-        if removed := state.pruner.drop(near_cameras(state.gaussians["means"], eyes, points), at_most=MOST):
+        if removed := state.pruner.drop(near_cameras(state.gaussians["means"], eyes, points), at_most=MOST_FLOATERS):
             _log.info(f"step {state.step}: removed {removed:,} floaters right in front of a camera")
