@@ -61,7 +61,7 @@ def render(
     views = views or list(filter(None, [opening(left).start]))
     views = [camera if width is None else camera.zoomed(width / camera.width) for camera in views]
     if video:  # whose colours have half the size
-        views = [camera._replace(width=camera.width // 2 * 2, height=camera.height // 2 * 2) for camera in views]
+        views = [each._replace(width=each.width // 2 * 2, height=max(each.height // 2, 1) * 2) for each in views]
         speed = fps or edit.speed or 24
         with replacing(out) as partial, progress_bar() as bar:
             images = (image_of(render_view(left, camera).rgb) for camera in bar.track(views, description="Rendering"))

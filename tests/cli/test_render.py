@@ -96,6 +96,7 @@ def test_a_film_without_a_camera_path(folder, tmp_path, capsys, name):
     assert [frame.shape[1::-1] for frame in frames] == [shown] * 5
     assert min(frame.std() for frame in frames) > 5
     assert min(np.abs(one - other).mean() for one, other in itertools.pairwise(frames)) > 1
+    assert run(folder / name, "-o", out, "--width", 2, "--seconds", 0.1, "--overwrite") == 0
 
 
 def test_an_image_is_that_of_the_start_view(folder, tmp_path):
