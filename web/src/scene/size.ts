@@ -29,8 +29,8 @@ export function reachOf(scene: Pick<Scene, "field">): number {
   return Math.max(reach || size(), SMALLEST);
 }
 
-/** World units in one unit of the page, whose near plane is then at most a tenth of the extent: 1 unless it is tiny. */
-export const unitOf = ({ extent }: Scene): number => Math.min(1, 10 * extent);
+/** World units in one unit of the page, whose near plane is then at most a hundredth of the extent. */
+export const unitOf = ({ extent }: Scene): number => Math.min(1, extent);
 
 /** The scene with all lengths in units of the page. */
 export function enlarged(scene: Scene, unit: number): Scene {
