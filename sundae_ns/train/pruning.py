@@ -255,7 +255,7 @@ class ScheduledPruning(Callback):
             notify_pruned(state.schedulers, state.step, run.source.total, last=with_head)
         if report is None:
             return
-        _log.info(summary(report))
+        _log.info(summary({**report, "step": state.step}))  # that of the schedule is another after a warm start
         if report["dropped_nonfinite"]:
             _log.warning(f"removed {report['dropped_nonfinite']} Gaussians that were not finite")
         if report["after"] < (config.target_gaussians or 0):

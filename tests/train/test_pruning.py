@@ -379,9 +379,11 @@ def test_a_run_that_prunes_or_is_not_to_says_nothing(build, training_of, capsys,
 def test_a_warm_start_counts_from_the_prune(build, training_of, capsys):
     model = build(pruning={"prune_at": 100}, head={"start_at": 102}, warm_start=Path("anything"))
     model._start = Start()  # of a file that need not be there
-    training_of(model, trainer_of())
+    training = training_of(model, trainer_of())
     (line,) = said(capsys)
     assert f"training ends after 3 steps, and the head needs more than 3 (head.start-at): {LATE}" in line
+    training.step(0)
+    assert "step 0: kept 30 of 60 Gaussians" in " ".join(capsys.readouterr().out.split())
 
 
 FLOATERS = [4, 50]  # Rows of a field of 60 Gaussians; the cameras are 3 away from its middle
