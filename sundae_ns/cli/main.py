@@ -78,7 +78,8 @@ def _dispatch(words: Sequence[str]) -> int:
         options[at:at] = [] if re.fullmatch(r"-?[\d.]+(e-?\d+|%)?", "".join(options[at : at + 1])) else ["0.25"]
     # Only the module of this command: some import torch, which takes a second.
     run = getattr(importlib.import_module(f"sundae_ns.cli.{name}"), name)
-    messages, later = io.StringIO(), wraps(run)(lambda *given, **named: partial(run, *given, **named))
+    messages = io.StringIO()
+    later = wraps(run)(lambda *given, **named: partial(run, *given, **named))  # runs behind tyro's own errors
     run.__doc__ = re.sub(r"\n {12}(?=\S)", " ", run.__doc__ or "")  # the help would keep the line breaks of arguments
     try:
         with redirect_stderr(messages):
