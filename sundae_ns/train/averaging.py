@@ -121,10 +121,9 @@ class Averaging(Callback):
             return
         if state.restored != self._restored:
             self._mean, self._restored = RunningMean(), state.restored
-        weights = weights_of(state)
         if state.step % AVERAGED_EVERY == 0:
-            self._mean.count_in(weights)
-        if state.step == last and (replaced := self._mean.replace(weights)):
+            self._mean.count_in(weights_of(state))
+        if state.step == last and (replaced := self._mean.replace(weights_of(state))):
             _log.info(f"step {state.step}: the weights are the mean of {self._mean.count} of the last steps")
             self._replaced = replaced if self._alone else {}
             if last >= run.schedule_length - 1:  # after a part, the mean continues with the rest of the run
