@@ -74,9 +74,10 @@ class SundaeTrainerConfig(TrainerConfig):
         CONSOLE.print(table)
 
     def make_paths_absolute(self) -> None:
-        """Make the paths absolute that a finished run is opened with, because it may be opened from another folder."""
+        """Make the paths absolute that ``config.yml`` states, because a run may be opened from another folder."""
         datamanager: Any = self.pipeline.datamanager
-        owners = [(self, "data"), (self, "output_dir"), (datamanager, "data"), (self.pipeline.model, "warm_start")]
+        owners: list[Any] = [(self, name) for name in ("data", "output_dir", "load_dir")]
+        owners += [(datamanager, "data"), (self.pipeline.model, "warm_start")]
         if datamanager.data is None:  # an unset path is nerfstudio's example
             owners.append((datamanager.dataparser, "data"))
         for owner, name in owners:

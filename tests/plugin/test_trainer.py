@@ -299,3 +299,6 @@ def test_the_schedule_is_logged_and_saved(tmp_path, monkeypatch, capsys):
     assert saved.pipeline.datamanager.data == tmp_path / "capture"
     assert saved.get_base_dir() == tmp_path / "outputs" / "e" / "sundae" / "t"
     assert (saved.pipeline.model.pruning.prune_at, saved.schedule_length) == (1200, 3000)
+    config.load_dir = Path("run that is resumed")
+    config.make_paths_absolute()
+    assert config.load_dir == tmp_path / "run that is resumed", "sundae train --resume offers no run twice"
