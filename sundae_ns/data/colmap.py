@@ -2,7 +2,7 @@
 
 The formats are those of COLMAP's documentation ("Output Format"). A binary file starts with a count of its entries; a
 text has one line per entry, and a second one with the observations of an image. Text is read before binary, but
-binary points before text, as nerfstudio does.
+binary points before text, as nerfstudio does. Names of images may have the backslashes of Windows.
 
     cameras.bin   i32 number, i32 model, u64 width, u64 height, f64 per parameter
     images.bin    i32 number, 7 f64 quaternion wxyz and translation, i32 camera, name and a zero byte, u64 count,
@@ -155,7 +155,7 @@ def _images(content: bytes, text: bool) -> Iterator[tuple[int, tuple[float, ...]
         for number, *words, camera, name in _rows(content, images=True):
             if len(words) != 7:
                 raise ValueError(f"image {number} has {len(words)} numbers as its pose")
-            yield int(number), tuple(map(float, words)), int(camera), name
+            yield int(number), tuple(map(float, words)), int(camera), name.replace("\\", "/")
         return
     at = _COUNT.size
     for _ in range(*_COUNT.unpack_from(content)):
@@ -163,7 +163,7 @@ def _images(content: bytes, text: bool) -> Iterator[tuple[int, tuple[float, ...]
         start = at + _IMAGE.size
         end = content.index(b"\0", start, start + 4096)
         at = end + 1 + _COUNT.size + 24 * _COUNT.unpack_from(content, end + 1)[0]
-        yield number, tuple(pose), camera, content[start:end].decode("utf-8")
+        yield number, tuple(pose), camera, content[start:end].decode("utf-8").replace("\\", "/")
     if at != len(content):
         raise ValueError(f"its entries take {at:,} bytes, it has {len(content):,}")
 

@@ -207,7 +207,7 @@ MODELS = {
     "a NaN position": (_patch("images.bin", 8 + 36, "<d", float("nan")), "image 1: the pose is nan"),
     "a missing camera": (_patch("images.bin", 8 + 60, "<i", 9), "camera 9 is not in the model"),
     "a name for a shell": (_patch("images.bin", 8 + 64, "15s", b"$(reboot).png!!"), "has quotes, .*rename it"),
-    "a name above": (_patch("images.bin", 8 + 64, "15s", b"../../a.png.png"), "leads out of the folder of images"),
+    "a name above": (_patch("images.bin", 8 + 64, "15s", b"..\\../a.png.png"), "leads out of the folder of images"),
     "an absolute name": (_patch("images.bin", 8 + 64, "15s", b"/etc/passwd.png"), "leads out of the folder of images"),
     "one image": (lambda model: _text(model, f"{ROW} a.png"), "has 1 image; training needs 2"),
     "an endless name": (_patch("images.bin", 8 + 64, "10000s", b"a" * 10**4), "is not a complete images.bin"),
