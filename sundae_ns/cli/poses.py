@@ -73,7 +73,7 @@ def check_poses(photos: Path, options: PoseOptions, *, remarks: bool = True) -> 
         check_video(photos, warn)
         return None
     if photos.exists() and not photos.is_dir():
-        raise DataError(f"{photos} is no folder of photos or video ({', '.join(SUFFIXES)}); sundae prune takes scenes")
+        raise DataError(f"{photos} is neither a folder nor a video ({', '.join(SUFFIXES)}); give the folder of photos")
     files = find_photos(photos, warn)
     masks = options.masks or masks_beside(photos)
     try:

@@ -97,7 +97,7 @@ REFUSALS = {
     "poses gone -o out": "gone cannot be read (No such file or directory); check the path",
     "poses trained -o out": "or a video by its own path",
     "poses text.mp4 -o out": "text.mp4 is not a video that",
-    "poses photos/0.JPG -o out": "sundae prune takes scenes",
+    "poses photos/0.JPG -o out": "give the folder of photos",
     "poses photos -o photos/capture": "photos/capture lies in photos",
     "poses photos -o out --frames 2": "frames is 2; give at least 3",
     "poses photos -o out --masks gone": "photos/0.JPG has no mask 0.png in gone; add it",
