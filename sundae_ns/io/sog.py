@@ -194,7 +194,7 @@ def read_sog(path: Path) -> tuple[dict[str, Tensor], Marks]:
 def _scene(path: Path, entry: Entry, size: int) -> tuple[dict[str, Tensor], Marks]:
     meta = parsed_json(entry(META))
     if (version := meta.get("version", 1)) not in (2, "2"):
-        raise DataError(f"{path} has version {version} of the format; convert it with splat-transform to version 2")
+        raise DataError(f"{path} has version {version}, not 2; convert it by splat-transform, gsplat's folder to .ply")
     up, offset = (vector(" ".join(map(str, meta.get(name, ())))) for name in ("up", "offset"))
     antialiased = any(str(meta.get(name)).lower() in ANTIALIASED for name in ("antialias", "model"))
     return _decoded(entry, meta, size), Marks(antialiased, meta.get("modelFrame") is True, up, offset)

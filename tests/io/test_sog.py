@@ -269,7 +269,7 @@ HOSTILE = {
     "a short codebook": (_meta(scales={"codebook": [0.0], "files": SCALES}), "out of bounds"),
     "a codebook of pairs": (_meta(scales={"codebook": [[0.0, 1.0]] * 256, "files": SCALES}), "scales has shape"),
     "NaN for a bound": (_meta(means={"mins": [math.nan] * 3, "maxs": [1] * 3, "files": MEANS}), "none is finite"),
-    "the first version": (_meta(version=GONE), "has version 1 of the format; convert it with"),
+    "the first version": (_meta(version=GONE), "has version 1, not 2; convert .*, gsplat's folder to"),
     "another SH degree": (_meta(**{"shN/bands": 1}), "cannot reshape"),
     "no SH degree": (_meta(shN={"bands": 9, "codebook": [0], "files": []}), "99 SH coefficients"),
 }
