@@ -171,6 +171,7 @@ class Trials(Callback):
         self._tolerance = Tolerance.of_drop(self.config.max_drop)
         self.begins_at = begins_at
         self.decides_head = options.head.mode == "auto"
+        self._head_at = begins_at if self.decides_head else state.head_starts_at  # Step after which it may be enabled
         self.progress = Progress()
         self.trial: Trial | None = None  # The current trial
         self.kept: dict[str, dict[str, Any]] = {}
@@ -351,7 +352,7 @@ class Trials(Callback):
     def enable_head(self, state: TrainingState, enabled: bool) -> None:
         """Enable or disable the head."""
         # Not from this step on: a run that is resumed on several GPUs counts other steps.
-        state.head_starts_at = self.begins_at if enabled else math.inf
+        state.head_starts_at = self._head_at if enabled else math.inf
 
     def hold_out(self, run: TrainingRun) -> None:
         """Hold out the views of the current trial, or else those of the trials to come."""

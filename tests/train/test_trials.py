@@ -45,8 +45,8 @@ class FakeRun:
         return most
 
 
-def trials_for(state, begins_at=-math.inf):
-    head, pruning = SimpleNamespace(mode="auto"), PruningConfig(keep_ratio=None)
+def trials_for(state, begins_at=-math.inf, mode="auto"):
+    head, pruning = SimpleNamespace(mode=mode), PruningConfig(keep_ratio=None)
     return Trials(SimpleNamespace(pruning=pruning, head=head, ssim_lambda=0.2), state, None, begins_at)
 
 
@@ -164,6 +164,9 @@ def test_several_gpus_prune_the_field_from_which_counts_were_tried(run):
     run.images_per_step, run.last_step, run.schedule_length = 2, 99, 100
     trials.before_training(run)
     assert (height(run), state.pruning["pruned_at"], state.pruning[COUNT]) == (0.0, NEVER, 0)
+    state.head_starts_at = 1
+    trials_for(state, begins_at=9, mode="residual").before_training(run)
+    assert state.head_starts_at == 1, "as where the run is resumed"
 
 
 def test_trials_are_there_for_an_undecided_head_which_is_disabled_or_an_undecided_count(build):
