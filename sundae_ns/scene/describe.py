@@ -28,7 +28,7 @@ from sundae_ns.scene.prune_scene import at_most, weights_in
 from sundae_ns.scene.scene import Scene, image_of, render
 from sundae_ns.scene.virtual_cameras import by_device, virtual_cameras
 
-HELD_OUT = 16  # cameras that measure the loss of a change
+HELD_OUT, SEEN_BY = 16, 64  # cameras that measure the loss of a change, and virtual ones that say what is seen
 PIXELS = {"cpu": 1 << 18, "cuda": 1 << 20}  # most of their images, by the device
 _PRODUCER = re.compile(rb'(?im)"generator"\s*:\s*"([^"]{1,200})"|^comment ([^\r\n]* (?:by|from) [^\r\n]{1,200})')
 
@@ -65,7 +65,7 @@ def describe(
     ``crop`` a box, lowest corner first, of 99% of what they see. Cameras are by default the stored, else virtual ones.
     """
     cameras = cameras or scene.cameras
-    views = for_cleaning(cameras) or virtual_cameras(scene, 64)
+    views = for_cleaning(cameras) or virtual_cameras(scene, SEEN_BY)
     weights = weights_in(scene, views, console=console)
     means = means_in_file(scene)
     with path.open("rb") if path.is_file() else BytesIO() as file:

@@ -37,7 +37,7 @@ from sundae_ns.scene.virtual_cameras import at_most, by_device, of_unit_size, re
 REFIT = {"cpu": (192, 1, 0.7), "cuda": (128, 4, 1.0)}  # steps of a refit, images of each, and factor of its rates
 REFIT_PIXELS, MOST_PIXELS = 1 << 18, 1 << 22  # most pixels of an image of a refit, and of one that measures visibility
 SAMPLED = 64, 8192  # random Gaussians of two files, whose difference gives the bytes of each
-LEAST, AIM = 0.97, 0.985  # shares of the size: the least that is accepted, and the aim of each file
+LEAST, AIM, FILES = 0.97, 0.985, 8  # least share of a size, the aim of each file, and most files of a search
 JUDGES, PIXELS = 8, 1 << 16  # cameras that compare fits and forms, and most pixels of their images for forms
 T = TypeVar("T")
 
@@ -402,7 +402,7 @@ def largest(
     """
     low, high = powers
     best, before = None, None
-    for _ in range(8):
+    for _ in range(FILES):
         made = at(power)
         if (size := bytes_of(made)) <= most:
             high, best = power, made

@@ -138,7 +138,6 @@ def test_quality_against_images_and_against_a_scene():
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 @pytest.mark.parametrize("name", [*random_field(1, features=0), "viewmat", "K"])
 def test_an_image_has_a_gradient_for_each_tensor_that_asks_for_one(name, backend):
-    """The gradient is the slope of the image's sum."""
     field, camera = scene(40).gaussians, cameras()[2]
     on_camera = name in ("viewmat", "K")
     value = (getattr(camera, name) if on_camera else field[name]).clone().requires_grad_()
