@@ -30,7 +30,8 @@ class Layout(NamedTuple):
 
 def is_posed(data: Path) -> bool:
     """Whether a path is a ``.json``, or a folder with ``transforms.json``, a COLMAP model or Blender's files."""
-    return data.suffix == ".json" or any([*data.glob("transforms.json"), *data.glob(_BLENDER), *_model_folders(data)])
+    names = ("transforms.json", _BLENDER)
+    return data.suffix == ".json" or any((data / name).is_file() for name in names) or bool(_model_folders(data))
 
 
 def is_model(folder: Path) -> bool:

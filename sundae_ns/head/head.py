@@ -226,4 +226,4 @@ def bytes_of_module(module: nn.Module | None) -> int:
 def stored_bytes(params: Mapping[str, Tensor], head: HeadConfig | None) -> int:
     """Bytes of Gaussians and their head, whose weights are not allocated; the one count that decides in training."""
     with torch.device("meta"):
-        return bytes_of(params) + (0 if head is None else bytes_of_module(CompensationHead(head)))
+        return bytes_of(params) + bytes_of_module(None if head is None else CompensationHead(head))

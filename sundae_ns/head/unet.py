@@ -48,7 +48,8 @@ class UNet(nn.Module):
         zero_init: bool = False,
     ) -> None:
         super().__init__()
-        widths = [min(width * 2**level, max_width or width * 2**level) for level in range(LEVELS)]
+        most = max_width or width * 2**LEVELS
+        widths = [min(width * 2**level, most) for level in range(LEVELS)]
         fold = pixel_unshuffle**2
         self.pixel_unshuffle = pixel_unshuffle
         inputs = [in_channels * fold, *widths[:-1]]

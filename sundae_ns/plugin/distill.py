@@ -85,7 +85,6 @@ class Distillation:
         counts = [self._teacher.num_gaussians, self.state.gaussians.num_gaussians, len(self.cameras)]
         seen = [scene.means, *(matrix for camera in given for matrix in camera[:2])]
         checksum = crc32(b"".join(matrix.detach().cpu().numpy().tobytes() for matrix in seen))
-        # As a resumed one has them
         self._options = {"steps": steps, "seed": seed, "head": head, "counts": counts, "scene": checksum}
         self.step = 0  # Number of steps that were trained
         self.gain: float | None = None  # PSNR that the head gained in its trial, dB; None before it, and without one

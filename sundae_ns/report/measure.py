@@ -194,12 +194,13 @@ def against_photos(data: Path | None) -> Callable[[Path], Subject]:
 def against_first(path: Path, reference: Scene, cameras: Sequence[Camera]) -> Callable[[Path], Subject]:
     """A function that opens scenes in views of the scene at a path, ``reference``, whose images are the truth."""
     views = [(camera.to(reference.device), render(reference, camera).rgb) for camera in cameras]
+    middle, reach = middle_and_reach(usable(reference))
 
     def subject(other: Path) -> Subject:
         if other == path:
             return Subject.of_file(reference, path, path.name, [])
         scene = replace(aligned(load(other), reference), background_color=reference.background_color)
-        (middle, reach), (there, size) = (middle_and_reach(usable(each)) for each in (reference, scene))
+        there, size = middle_and_reach(usable(scene))
         if (away := float((there - middle).norm())) > max(reach, size) or not 0.5 <= size / reach <= 2:
             found = f"{other} is {size / reach:.3g} times as large as {path}, and its middle is {away:.3g} away"
             _log.warning("%s; if it was moved or scaled, undo that by sundae_ns.transform", found)

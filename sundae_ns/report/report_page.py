@@ -22,6 +22,7 @@ from torch import Tensor
 from sundae_ns.core.metrics import ViewQuality, check_pair
 from sundae_ns.core.tables import number
 from sundae_ns.report.measure import METRICS, Measured, Subject, cells_of
+from sundae_ns.scene.scene import image_of
 from sundae_ns.train.curve import CountCurve
 
 MOST_VIEWS = 24  # that a page shows of a scene
@@ -115,8 +116,7 @@ def _plain(image: Tensor) -> Tensor:
 
 
 def _image(image: Tensor, size: tuple[int, int]) -> Image.Image:
-    whole = Image.fromarray((255 * _plain(image)).round().to(torch.uint8).numpy())
-    return whole.resize(size, Image.Resampling.LANCZOS)
+    return image_of(_plain(image)).resize(size, Image.Resampling.LANCZOS)
 
 
 def _encoded(image: Image.Image) -> str:

@@ -228,8 +228,9 @@ class Scene:
         """Settings that render the scene with all of its SH degrees; ``BackendError`` without the rasteriser."""
         rasteriser, enabled = select_backend(backend, self.device), self.head if head else None
         near = NEAR_PLANE * min(1.0, self.extent)  # a scene of millimetres would lie behind the usual one
-        settings = RenderSettings(rasteriser, head=enabled, trained_focal=self.trained_focal, near_plane=near)
-        return replace(settings, antialiased=self.antialiased)
+        return RenderSettings(
+            rasteriser, antialiased=self.antialiased, head=enabled, trained_focal=self.trained_focal, near_plane=near
+        )
 
     def __repr__(self) -> str:
         head = "no head" if self.head is None else f"{self.head.config.size} head"

@@ -86,5 +86,6 @@ def curve_table(points: Sequence[CurvePoint]) -> list[str]:
 
 
 def _figures(value: float, loss: float, error: float, digits: int) -> list[str]:
-    known = f"{value:.{digits}f}", f"{loss:.{digits}f} ± {error:.{digits}f}"
-    return [*known] if math.isfinite(loss) else ["", "not finite"]
+    if not math.isfinite(loss):
+        return ["", "not finite"]
+    return [f"{value:.{digits}f}", f"{loss:.{digits}f} ± {error:.{digits}f}"]
