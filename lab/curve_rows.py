@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 RESULTS = Path("benchmarks/results")
+COMMIT = "08a19f60"
 folder = Path(sys.argv[1])
 
 
@@ -46,21 +47,35 @@ def flat(result):
             "bytes_head": m["bytes_head"], "seed": m["seed"]}  # fmt: skip
 
 
-curve, runs = [], []
+curve, runs, times = [], [], []
 for path in sorted(folder.glob("quality-*/done/*.json")):
     result = json.loads(path.read_text())
     if "warm-up" not in path.name and result.get("packed"):
         curve.append(curve_row(result, flat(result), False))
-for suite in sorted(folder.glob("suite-*")) + sorted(folder.glob("splatfacto-*")):
+for suite in sorted(folder.glob("suite-*")) + sorted(folder.glob("splatfacto-*")) + sorted(folder.glob("mcmc-*")):
+    if not (suite / "results.csv").exists():
+        continue
     for row in csv.DictReader((suite / "results.csv").open()):
         for name in ("keep_ratio", "psnr", "ssim", "psnr_base", "ssim_base", "psnr_fitted", "peak_vram_mib", "ms_frame", "ms_splat", "ms_head", "train_s", "prune_s"):
             row[name] = short(row[name])
+        row["keep_ratio"] = {"splatfacto": "1.0", "mcmc": "0.1"}.get(row["variant"], row["keep_ratio"])
         runs.append(row)
     for line in (suite / "results.jsonl").read_text().splitlines():
         result = json.loads(line)
+        if result["alone"]:
+            flat_row = next(row for row in runs if row["scene"] == result["job"]["scene"] and str(row["seed"]) == str(result["job"]["seed"]) and row["method"] == result["job"]["method"])
+            times.append({"arm": flat_row["method"], "scene": flat_row["scene"], "steps": 30000, "seed": int(flat_row["seed"]), "train_s": round(float(flat_row["train_s"]), 2),
+                          "ms_frame": float(flat_row["ms_frame"]), "psnr": float(flat_row["psnr"]), "ssim": float(flat_row["ssim"]), "primitives": int(flat_row["primitives"]),
+                          "head": int(flat_row["bytes_head"]) > 0, "peak_mib": round(float(flat_row["peak_vram_mib"])), "gpu": flat_row["gpu"], "commit": COMMIT})  # fmt: skip
         if result["job"]["arm"] == "sundae-auto":
             curve.append(curve_row(result, flat(result), True))
 for row in curve:
     print({k: row[k] for k in ("capture", "share", "primitives", "packed_bytes", "psnr", "ssim", "tuned_bytes", "tuned_psnr", "head")})
 put("curve.csv", curve, lambda row: (row["capture"], row["method"], row["seed"] if isinstance(row["seed"], str) else str(row["seed"]), "chosen" if row["chosen"] == "yes" else float(row["share"])))
 put("runs.csv", runs, lambda row: (row["scene"], row["variant"], row["seed"], row["keep_ratio"] if row["variant"] == "sundae" else "", row["steps"]))
+path = RESULTS / "training_time.jsonl"
+rows = [json.loads(line) for line in path.read_text().splitlines()]
+new = {(row["arm"], row["scene"]): row for row in times}
+rows = [new.pop((row["arm"], row["scene"]), row) for row in rows] + list(new.values())
+path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+print("training_time.jsonl", len(times), "rows")
