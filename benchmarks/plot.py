@@ -111,7 +111,7 @@ def plot_asked() -> Any:
         spots = [(float(row["psnr_lost"]), int(row["removed"])) for row in fields]
         cleaning.plot(*zip(*spots), marker, label=strength, fillstyle="none")
     cleaning.legend(fontsize=7)
-    sizes.set(title="asked sizes, trained", xlabel="MB got", ylabel="test PSNR, dB")
+    sizes.set(title="asked sizes, trained", xlabel="MB got", ylabel="test PSNR, dB", xlim=(0, 7))
     levels.set(title="levels, mean of fields", xlabel="share of Gaussians", ylabel="PSNR to the field, dB")
     cleaning.set(title="cleaning by strength", xlabel="PSNR lost, dB", ylabel="floaters found of 400", ylim=(360, 401))
     few.set(title="few photos, mean of seven captures", xlabel="training views", ylabel="test PSNR, dB")
