@@ -74,6 +74,7 @@ def positions(values: Any, name: str) -> Tensor:
 def usual_defaults() -> Iterator[None]:
     """Compute in float32, with new tensors on the CPU and for autograd, in a block, whatever a caller has set."""
     given = torch.empty(0)
+    with_gradients = torch.is_grad_enabled()
     with ExitStack() as stack:
         for kind in filter(torch.is_autocast_enabled, ("cpu", "cuda")):
             stack.enter_context(torch.autocast(kind, enabled=False))
@@ -82,6 +83,7 @@ def usual_defaults() -> Iterator[None]:
             torch.set_default_dtype(torch.float32)
             stack.enter_context(torch.device("cpu"))
             stack.enter_context(torch.inference_mode(False))
+            stack.enter_context(torch.set_grad_enabled(with_gradients))  # the line above enables gradients
         yield
 
 

@@ -83,7 +83,7 @@ def tile_lists(splats: Splats, width: int, height: int, *, capacity: Capacity) -
     counts = torch.empty(n * lanes, dtype=torch.int32, device=device)
     kernels["count_tiles"](n * lanes, [*geometry, counts])
     ends = counts.cumsum(0)
-    capacity.needed.append(ends[-1])
+    capacity.needed.append(ends[-1].clone())  # a view would keep the sums of all Gaussians
     pairs, below = (int(ends[-1]), 0) if capacity.pairs is None else (capacity.pairs, 1)
     tiles = torch.full((pairs,), columns * rows, dtype=dtype, device=device)
     primitives = torch.zeros(pairs, dtype=torch.int32, device=device)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Any, Literal, TypeVar, cast
 
 import torch
@@ -14,6 +14,7 @@ from torch import Tensor
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import BackendError, ConfigError, DataError, one_line
 from sundae_ns.core.gaussians import MAX_SH_DEGREE
+from sundae_ns.core.values import usual_defaults
 from sundae_ns.rasterize import gsplat_kernels
 from sundae_ns.rasterize.gsplat_backend import GsplatBackend, RecordableGsplat, check_kernels_take
 from sundae_ns.rasterize.reference import ReferenceBackend
@@ -23,6 +24,7 @@ BackendName = Literal["auto", "gsplat", "cpu", "reference"]
 T = TypeVar("T")
 
 
+@usual_defaults()
 def rasterize(inputs: Inputs, *, backend: Backend) -> Rasterization:
     """Splat N Gaussians into one pinhole camera (EWA splatting, front-to-back blending; Kerbl et al. 2023).
 
@@ -55,43 +57,22 @@ def rasterize_cameras(inputs: Inputs, viewmats: Tensor, Ks: Tensor, *, backend: 
         raise DataError(f"colors has shape {list(colors.shape)}; pass [{count}, {len(inputs.means)}, C]")
     views = [inputs.camera._replace(viewmat=viewmat, K=K) for viewmat, K in zip(viewmats, Ks, strict=True)]
     singles = [replace(inputs, colors=color, camera=camera) for color, camera in zip(colors, views, strict=True)]
-    _check(singles[0])
     if isinstance(backend, GsplatBackend) and len(inputs.means):
+        _check(singles[0])
         return backend.rasterize_cameras(inputs, viewmats, Ks)
-    images = (two_at_once if inputs.means.is_cpu and not torch.is_grad_enabled() else map)(backend.rasterize, singles)
-    return torch.stack([image.colors for image in images])
+    over_views = two_at_once if inputs.means.is_cpu and not torch.is_grad_enabled() else map
+    return torch.stack([image.colors for image in over_views(partial(rasterize, backend=backend), singles)])
 
 
 def two_at_once(function: Callable[[Any], T], views: Iterable[Any]) -> Iterator[T]:
-    """As ``map``, for views on a CPU: two at a time, each on half of the threads; of one thread, one."""
+    """As ``map`` without gradients, for views on a CPU: two at a time, each on half of the threads; of one, one."""
     threads = torch.get_num_threads()
     torch.set_num_threads(threads)  # two threads cannot make the pool of a forked process
     try:
         with ThreadPoolExecutor(min(2, threads), "views", torch.set_num_threads, (max(1, threads // 2),)) as pool:
-            yield from pool.map(function, views)
+            yield from pool.map(torch.no_grad()(function), views)  # each thread has a mode of its own
     finally:
         torch.set_num_threads(threads)
-
-
-def spherical_harmonics(degree: int, directions: Tensor, first: Tensor, rest: Tensor, *, backend: Backend) -> Tensor:
-    """Evaluate real spherical harmonics up to ``degree``: the raw sum ``[N, 3]``, without the 0.5 that colours add.
-
-    ``directions`` ``[N, 3]``, of any length, lead from the camera to the Gaussian; zero vectors are taken as +z,
-    without gradient. Coefficients ``[N, 3]``, ``[N, K - 1, 3]`` have the order and the signs of 3DGS; only the
-    first ``(degree + 1) ** 2`` are read. ``DataError`` for a degree outside of 0 to 4, or a wrong shape.
-    """
-    if not 0 <= degree <= MAX_SH_DEGREE:
-        raise DataError(f"spherical harmonics of degree {degree} are unknown; use 0 to {MAX_SH_DEGREE}")
-    n = directions.shape[0]
-    _check_shapes((directions, "directions", (n, 3)), (first, "first", (n, 3)))
-    needed = (degree + 1) ** 2 - 1
-    if rest.dim() != 3 or rest.shape[0] != n or rest.shape[1] < needed or rest.shape[2] != 3:
-        raise DataError(f"rest has shape {list(rest.shape)}; degree {degree} needs [{n}, {needed} or more, 3]")
-    _check_alike("directions", directions, first=first, rest=rest)
-    # Replace them here: gsplat's kernel returns NaN where the camera is at a Gaussian's centre.
-    is_zero = (directions == 0).all(dim=-1, keepdim=True)
-    ahead = constant((0.0, 0.0, 1.0), directions.dtype, directions.device)
-    return backend.spherical_harmonics(degree, torch.where(is_zero, ahead, directions), first, rest)
 
 
 def harmonic_colors(
@@ -99,14 +80,26 @@ def harmonic_colors(
 ) -> Tensor:
     """Colours of Gaussians as seen from a point: their harmonics plus 0.5, at least 0 ``[N, 3]``.
 
-    ``center`` is that of the camera ``[3]``, or one for each Gaussian ``[N, 3]``. ``features_dc`` ``[N, 3]`` are the
-    first coefficients, ``features_rest`` ``[N, K - 1, 3]`` at least those of the degree; errors as
-    :func:`spherical_harmonics`.
+    ``center`` is that of the camera ``[3]``, or one for each Gaussian ``[N, 3]``; one that is there is seen along +z,
+    without a gradient of its place. Coefficients ``features_dc`` ``[N, 3]`` and ``features_rest`` ``[N, K - 1, 3]``, of
+    this degree or a higher one, have the order and the signs of 3DGS. ``DataError`` for a degree outside of 0 to 4, and
+    for a tensor of a wrong shape, dtype or device.
     """
-    if isinstance(backend, RecordableGsplat) and len(means):
+    if not 0 <= degree <= MAX_SH_DEGREE:
+        raise DataError(f"spherical harmonics of degree {degree} are unknown; use 0 to {MAX_SH_DEGREE}")
+    n, needed, rest = len(means), (degree + 1) ** 2 - 1, features_rest.shape
+    _check_shapes((means, "means", (n, 3)), (features_dc, "features_dc", (n, 3)))
+    if len(rest) != 3 or rest[0] != n or rest[1] < needed or rest[2] != 3:
+        raise DataError(f"features_rest has shape {list(rest)}; degree {degree} needs [{n}, {needed} or more, 3]")
+    _check_alike("means", means, center=center, features_dc=features_dc, features_rest=features_rest)
+    if isinstance(backend, RecordableGsplat) and n:
         check_kernels_take(means)
         return cast("Tensor", gsplat_kernels.harmonic_colors(degree, means, center, features_dc, features_rest))
-    return (spherical_harmonics(degree, means - center, features_dc, features_rest, backend=backend) + 0.5).clamp_min(0)
+    directions = means - center
+    # Replace zeros here: gsplat's kernel returns NaN for them.
+    ahead = constant((0.0, 0.0, 1.0), means.dtype, means.device)
+    directions = torch.where((directions == 0).all(dim=-1, keepdim=True), ahead, directions)
+    return (backend.spherical_harmonics(degree, directions, features_dc, features_rest) + 0.5).clamp_min(0)
 
 
 def blending_weights(inputs: Inputs, pixels: Tensor | None = None, *, backend: Backend) -> Tensor:
@@ -145,6 +138,8 @@ def _check_shapes(*values: tuple[Tensor, str, tuple[int, ...]]) -> None:
 
 
 def _check_alike(name: str, model: Tensor, **others: Tensor) -> None:
+    if model.dtype not in (torch.float32, torch.float64):
+        raise DataError(f"{name} is {model.dtype}; give float32 or float64")
     for other, value in others.items():
         if value.dtype != model.dtype or value.device != model.device:
             raise DataError(

@@ -106,7 +106,8 @@ def project(inputs: Inputs) -> Projection:
         spread = (0.25 * (xx - yy).square() + xy * xy).clamp(min=0.01).sqrt()
         radii = torch.ceil(3.0 * (0.5 * (xx + yy) + spread).sqrt()).clamp(max=MAX_RADIUS)
         inside = (means2d + radii[:, None] > 0) & (means2d - radii[:, None] < means2d.new_tensor([width, height]))
-        radii = (radii * inside.all(dim=-1) * in_range).to(torch.int32)
+        # Not by a product, in which NaN times 0 stays NaN.
+        radii = torch.where(inside.all(dim=-1) & in_range, radii, 0).to(torch.int32)
     return Projection(means2d, torch.stack([xx, xy, yy], dim=-1), conics, camera[:, 2], compensations, radii)
 
 

@@ -19,7 +19,7 @@ from sundae_ns.core.errors import MemoryExhaustedError
 
 @dataclass(frozen=True)
 class Inputs:
-    """N Gaussians after activation and a pinhole camera. All tensors have one dtype and device."""
+    """N Gaussians after activation and a pinhole camera. All tensors are float32 or float64, on one device."""
 
     means: Tensor  # Centres, world units ``[N, 3]``
     quats: Tensor  # Rotations as wxyz quaternions of any length; all-zero ones are the identity ``[N, 4]``

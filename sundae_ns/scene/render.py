@@ -190,7 +190,6 @@ def contribution(
     total = source.gaussians["means"].new_zeros(source.gaussians.num_gaussians)
     largest = source.gaussians["scales"].amax(dim=1).exp()
 
-    @torch.no_grad()
     def of_view(view: tuple[Camera, Tensor | None]) -> tuple[Any, Tensor, Any]:  # rows, their weights, and the image
         camera, mask = view
         if mask is not None and tuple(mask.shape) != (camera.height, camera.width, 1):

@@ -23,7 +23,7 @@ from sundae_ns.rasterize.cpu import backend as cpu_backend
 from sundae_ns.rasterize.cpu import parallel, tiles
 from sundae_ns.rasterize.gsplat_backend import RecordableGsplat
 from sundae_ns.rasterize.gsplat_kernels import Capacity
-from sundae_ns.rasterize.interface import select_backend, spherical_harmonics
+from sundae_ns.rasterize.interface import harmonic_colors, select_backend
 from sundae_ns.rasterize.reference import project
 from sundae_ns.rasterize.types import is_gsplat_1_5
 
@@ -245,6 +245,7 @@ def test_footprints_that_overflow_integers(dtype, scale):
     values, camera = scene(40), make_view(20, 20)
     values["opacities"][:] = 0.0
     values["scales"][:10] = math.log(scale) if scale > 0 else math.nan
+    assert splat({name: value.to(dtype) for name, value in values.items()}, camera, REFERENCE).radii.min() >= 0
     ours = render(values, camera, dtype, CPU)
     for name, value in ours.items():
         # The gradient behind the activation is NaN: zero times infinity.
@@ -291,7 +292,7 @@ def test_gradients_of_some_inputs_by_some_outputs(wanted, output):
 def harmonics(degree, directions, coeffs, backend):
     """Values, and the gradients of a random functional of them."""
     leaves = [value.detach().clone().requires_grad_() for value in (directions, coeffs)]
-    value = spherical_harmonics(degree, leaves[0], leaves[1][:, 0], leaves[1][:, 1:], backend=backend)
+    value = harmonic_colors(degree, leaves[0], 0 * directions[0], leaves[1][:, 0], leaves[1][:, 1:], backend=backend)
     weights = torch.randn(value.shape, generator=torch.Generator().manual_seed(7), dtype=F64)
     weights[::5] = 0  # Gaussians that no pixel sees
     loss = (value * weights.to(value.device)).sum()
@@ -406,7 +407,7 @@ def test_no_gaussians_are_an_empty_image_and_float64_is_refused():
     assert select_backend("auto", "cuda").name == "gsplat"
     directions = torch.ones(1, 3, device="cuda", dtype=F64)
     with pytest.raises(BackendError, match="float32 on cuda"):
-        spherical_harmonics(0, directions, directions, directions[:, None][:, :0], backend=on_gpu("auto"))
+        harmonic_colors(0, *3 * [directions], directions[:, None][:, :0], backend=on_gpu("auto"))
 
 
 SMALL = scene(800), make_view(60, 50)
@@ -423,6 +424,13 @@ def test_results_do_not_depend_on_the_number_of_threads(monkeypatch):
         torch.set_num_threads(count)
         results.append([*render(values, camera, F32, CPU).values(), *harmonics(3, directions, coeffs, CPU)])
     assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
+
+
+@each_backend
+def test_autocast_changes_nothing(backend):
+    image = splat(*SMALL, backend).colors
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(splat(*SMALL, backend).colors, image)
 
 
 def test_threads_that_rasterise_at_once():
@@ -456,14 +464,6 @@ def test_an_image_of_many_pairs_is_blended_by_regions(monkeypatch):
     assert sorted(drawn_tiles.tolist()) == list(range(70))
     monkeypatch.setattr(tiles, "MOST_PAIRS", 0)  # a tile is not cut
     assert torch.equal(render(values, camera, F32, CPU)["image"], once["image"])
-
-
-def test_unsupported_dtypes_are_refused():
-    values = {name: value.bfloat16() for name, value in scene(5).items()}
-    with pytest.raises(BackendError, match="^the cpu rasterizer takes float32 or float64 on a CPU, not torch.bfl"):
-        splat(values, make_view(8, 8), CPU)
-    with pytest.raises(BackendError, match="float32 or float64"):
-        spherical_harmonics(1, *(torch.ones(2, *size).half() for size in ((3,), (3,), (3, 3))), backend=CPU)
 
 
 def test_a_forked_process_runs_compiled_loops():

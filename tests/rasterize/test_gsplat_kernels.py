@@ -169,6 +169,7 @@ def test_capacity_keeps_the_lists_and_reports_the_number_of_pairs():
     exact = by_tile(primitives, 150, 100, capacity)
     (needed,) = capacity.needed
     assert int(needed) == sum(map(len, exact))
+    assert needed.untyped_storage().nbytes() == 8  # the sums of all Gaussians are not kept
     for spare in (0, 1000):
         *found, below = by_tile(primitives, 150, 100, Capacity(int(needed) + spare))[: len(exact) + 1]
         assert all(torch.equal(a, b) for a, b in zip(found, exact, strict=True))

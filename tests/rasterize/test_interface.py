@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -10,7 +11,9 @@ from splat_inputs import blending_weights, rasterize, rasterize_cameras, several
 from sundae_ns.core.errors import BackendError, ConfigError, DataError, MemoryExhaustedError
 from sundae_ns.rasterize import interface
 from sundae_ns.rasterize import types as limits
-from sundae_ns.rasterize.interface import select_backend, spherical_harmonics
+from sundae_ns.rasterize.gsplat_backend import RecordableGsplat
+from sundae_ns.rasterize.gsplat_kernels import Capacity
+from sundae_ns.rasterize.interface import harmonic_colors, select_backend
 
 REFERENCE = select_backend("reference", "cpu")
 
@@ -67,13 +70,14 @@ def one_view(call=rasterize, **changes):
     return call(**{**values, "viewmat": torch.eye(4), "K": torch.eye(3), **size, **changes}, backend=REFERENCE)
 
 
-def views(**changes):
+def views(backend=REFERENCE, **changes):
     shared, cameras = several_views()
-    return rasterize_cameras(**shared, **{**cameras, **changes}, width=4, height=4, backend=REFERENCE)
+    return rasterize_cameras(**shared, **{**cameras, **changes}, width=4, height=4, backend=backend)
 
 
-def harmonics(degree, terms):
-    return spherical_harmonics(degree, *torch.ones(2, 2, 3).unbind(), torch.ones(2, terms - 1, 3), backend=REFERENCE)
+def harmonics(degree, terms, backend=REFERENCE, **types):
+    values = torch.ones(2, 3), torch.ones(3), torch.ones(2, 3, **types), torch.ones(2, terms - 1, 3)
+    return harmonic_colors(degree, *values, backend=backend)
 
 
 REFUSED = [
@@ -93,6 +97,9 @@ REFUSED = [
     (lambda: views(colors=torch.ones(3, 49, 4)), r"colors has shape \[49, 4\]; pass \[50, C\]"),
     (lambda: harmonics(5, 36), "degree 5"),
     (lambda: harmonics(2, 8), "needs"),
+    (lambda: harmonics(1, 4, dtype=torch.float64), "features_dc is torch.float64 on cpu but means is torch.float32"),
+    (lambda: harmonics(2, 8, RecordableGsplat(Capacity())), "features_rest has shape .* needs"),
+    (lambda: one_view(means=torch.ones(3, 3).bfloat16()), "means is torch.bfloat16; give float32 or float64"),
 ]
 
 
@@ -100,6 +107,15 @@ REFUSED = [
 def test_wrong_arguments(call, message):
     with pytest.raises(DataError, match=message):
         call()
+
+
+def test_several_views_without_gradients_record_none():
+    torch.set_num_threads(2)
+    modes = []
+    spy = Mock(rasterize=lambda inputs: modes.append(torch.is_grad_enabled()) or REFERENCE.rasterize(inputs))
+    with torch.no_grad():
+        views(spy)
+    assert modes == 3 * [False]
 
 
 def test_blending_weights_with_pixel_weights():

@@ -209,6 +209,9 @@ def test_modes_of_the_caller_stay_and_change_no_value():
         assert torch.equal(sn.render(SCENE, look_at((2, 2, 2), (0.5, 0.5, 0.5), width=24, height=20)).rgb, image)
         torch.testing.assert_close(CAMERA.center, torch.full((3,), 2.0))
         assert (torch.ones(1).is_inference(), torch.is_autocast_enabled("cpu")) == (True, True)
+    trained = sn.Scene(SCENE.gaussians.replaced({"means": SCENE.gaussians["means"].clone().requires_grad_()}))
+    with torch.no_grad(), torch.device("meta"):
+        assert not sn.render(trained, CAMERA).rgb.requires_grad
 
 
 def test_the_rule_of_a_prune_is_that_of_the_command():

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sundae_ns.core.errors import BackendError
 from sundae_ns.rasterize import reference
 from sundae_ns.rasterize.cpu.compositing import composite
 from sundae_ns.rasterize.cpu.parallel import as_array, borrowing, compiled, inlined, parallel_for
@@ -30,13 +29,12 @@ _write_basis = borrowing(reference.write_basis)
 
 
 class CpuBackend:
-    """The reference in compiled loops; ``BackendError`` unless the tensors are float32 or float64 on a CPU."""
+    """The reference in compiled loops, for tensors on a CPU."""
 
     name = "cpu"
 
     def rasterize(self, inputs: Inputs) -> Rasterization:
         """Render one view."""
-        _check(inputs.means)
         projection = project(inputs)
         opacities, colors = blended_values(inputs, projection)
         means2d = projection.means2d[None]
@@ -47,17 +45,10 @@ class CpuBackend:
 
     def spherical_harmonics(self, degree: int, directions: Tensor, first: Tensor, rest: Tensor) -> Tensor:
         """See :meth:`.Backend.spherical_harmonics`."""
-        _check(directions)
         outputs = (torch.empty_like(directions, memory_format=torch.contiguous_format),)
         loops = _evaluate, _evaluate_backward, MIN_PER_THREAD
         options = degree, rest.shape[1] * rest.requires_grad
         return cast("Tensor", _Loops.apply(loops, options, outputs, 1, directions, first, rest)[0])
-
-
-def _check(tensor: Tensor) -> None:
-    if tensor.dtype not in (torch.float32, torch.float64) or tensor.device.type != "cpu":
-        wrong = f"{tensor.dtype} on {tensor.device}; convert, or use 'reference'"
-        raise BackendError(f"the cpu rasterizer takes float32 or float64 on a CPU, not {wrong}")
 
 
 class _Loops(torch.autograd.Function):
