@@ -6,7 +6,7 @@ import gc
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Generic, TypeVar
 
 import torch
@@ -35,18 +35,6 @@ def warm_up(device: torch.device) -> Iterator[None]:
         torch.cuda.current_stream(device).wait_stream(side)
 
 
-@contextmanager
-def _no_garbage_collection() -> Iterator[None]:
-    """Disable garbage collection: destroying a graph would break a recording."""
-    before = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if before:
-            gc.enable()
-
-
 def _side_stream(device: torch.device) -> torch.cuda.Stream:
     # One for all graphs, because memory cached for one stream does not serve another; one per thread, because work of
     # another thread would be recorded too.
@@ -71,7 +59,10 @@ def record(
     # Name the stream: torch's own belongs to the device that was current at its first recording.
     side = _side_stream(device)
     errors: list[RuntimeError] = []
-    with _one_at_a_time, torch.cuda.device(device), _no_garbage_collection():
+    with _one_at_a_time, torch.cuda.device(device), ExitStack() as stack:
+        if gc.isenabled():  # collecting an earlier graph would break the recording
+            gc.disable()
+            stack.callback(gc.enable)
         generator = torch.cuda.default_generators[torch.cuda.current_device()]
         before = generator.clone_state()
         try:

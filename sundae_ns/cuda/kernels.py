@@ -83,7 +83,7 @@ class Kernel:
         """Launch at least this many threads on the current stream; ``BackendError`` if the driver refuses.
 
         Tensors, on the kernel's device, are passed as pointers to their first element, None as a null pointer, integers
-        as C ints, floats as doubles.
+        as C ints, floats as doubles. Integers are below 2^31, else a ``BackendError`` too.
         """
         values = [_as_c(argument, self._device) for argument in arguments]
         pointers = (c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
@@ -149,7 +149,11 @@ def _as_c(argument: Argument, device: torch.device) -> ctypes.c_void_p | ctypes.
         if argument.device != device:
             raise BackendError(f"a kernel on {device} got a tensor on {argument.device}: pass tensors on {device}")
         return c_void_p(argument.data_ptr())
-    return c_int(argument) if isinstance(argument, int) else c_double(argument)
+    if isinstance(argument, float):
+        return c_double(argument)
+    if abs(argument) >= 2**31:  # ctypes would cut the upper bits off
+        raise BackendError(f"a kernel got {argument:,}, and counts to 2^31: use fewer Gaussians, or a smaller image")
+    return c_int(argument)
 
 
 def _library(name: str) -> ctypes.CDLL:

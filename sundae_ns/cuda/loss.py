@@ -12,8 +12,8 @@ from typing import Any, cast
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from sundae_ns.core.errors import SundaeError
 from sundae_ns.core.metrics import SSIM_WINDOW
 from sundae_ns.cuda.kernels import Launch, load_kernels
 
@@ -40,7 +40,7 @@ def loss_kernels(device: torch.device) -> dict[str, Launch]:
 def fused_loss(
     image: Tensor, target: Tensor, weight: float, base: Tensor | None = None, l1_weight: float | None = None
 ) -> tuple[Tensor, Tensor | None]:
-    """``(1 - weight) L1 + weight (1 - SSIM)`` of an image, and L1 of its base colours or None; differentiable scalars.
+    """``(1 - weight) L1 + weight (1 - SSIM)`` of an image, and L1 of its base colours or None; once differentiable.
 
     L1 is the mean over all values, with ``l1_weight`` if it is given. SSIM is pytorch_msssim's, over windows inside the
     image, with a data range of 1. All images are float32 on a CUDA device ``[H, W, 3]``, both sides at least
@@ -78,13 +78,8 @@ class _Loss(torch.autograd.Function):
         return losses.sum(), None if base_losses is None else base_losses.sum()
 
     @staticmethod
-    def backward(  # type: ignore[override]
-        ctx: Any, grad_loss: Tensor, grad_base_loss: Tensor | None
-    ) -> tuple[Tensor | None, ...]:
-        if torch.is_grad_enabled():  # create_graph=True: the kernel would be missing from that graph
-            raise SundaeError(
-                "the fused loss has no second derivative; use float64 images, whose loss is computed by convolutions"
-            )
+    @once_differentiable
+    def backward(ctx: Any, grad_loss: Tensor, grad_base_loss: Tensor | None) -> tuple[Tensor | None, ...]:
         image, base, target, derivatives = ctx.saved_tensors
         grad_image, grad_base = torch.empty_like(image), None if base is None else torch.empty_like(base)
         height, width, _ = image.shape

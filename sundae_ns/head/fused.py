@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, cast
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from sundae_ns.cuda.kernels import Argument, Launch, load_kernels
 from sundae_ns.head.unet import SLOPE, UNet
@@ -44,8 +45,8 @@ def compensated(net: UNet, residual: bool, base: Tensor, splatted: Tensor, alpha
 def correction(net: UNet, residual: bool, splatted: Tensor, alpha: Tensor, dtype: torch.dtype) -> Tensor:
     """One correction times accumulation, or one image if the network makes it by itself: ``[H, W, 3]`` float32.
 
-    It has gradients for splatted values, accumulation and the network's parameters. Arguments and errors are those of
-    :func:`compensated`.
+    Once differentiable, by splatted values, accumulation and the network's parameters. Arguments and errors are those
+    of :func:`compensated`.
     """
     parameters = [value for layer in (*convolutions(net), net.out) for value in (layer.weight, layer.bias)]
     return cast("Tensor", _Correction.apply(splatted, alpha, net, residual, dtype, *parameters))
@@ -65,7 +66,8 @@ class _Correction(torch.autograd.Function):
         return unfold_pixels(net, ctx.tape.last, splatted.new_zeros(height, width, 3), alpha, ctx.launches)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         (alpha,) = ctx.saved_tensors
         net, launches, tape = ctx.net, ctx.launches, ctx.tape
         grad_raw, grad_alpha, *grad_last = unfold_backward(net, tape.last, gradient, alpha, launches)

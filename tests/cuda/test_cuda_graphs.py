@@ -1,7 +1,7 @@
 """The cache of CUDA graphs, and the recording of one; users of recorded graphs have tests of their own."""
 
 import gc
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from unittest import mock
 
@@ -46,22 +46,7 @@ def test_the_least_recently_used_graph_is_dropped():
     assert cache.get(0, lambda: -1) is None  # the count of repeats starts anew
 
 
-@pytest.mark.parametrize("fails", [False, True])
-@pytest.mark.parametrize("enabled", [True, False])
-def test_no_garbage_collection_during_a_recording(enabled, fails):
-    try:
-        if not enabled:
-            gc.disable()
-        with suppress(ValueError), cuda_graphs._no_garbage_collection():
-            assert not gc.isenabled()
-            if fails:
-                raise ValueError
-        assert gc.isenabled() == enabled
-    finally:
-        gc.enable()
-
-
-def test_a_failed_recording_restores_stream_and_generator(monkeypatch):
+def test_a_failed_recording_restores_stream_generator_and_garbage_collection(monkeypatch, request):
     streams, generator, ended, failed = ["main"], mock.Mock(), mock.Mock(), []
 
     @contextmanager
@@ -97,10 +82,13 @@ def test_a_failed_recording_restores_stream_and_generator(monkeypatch):
     ended.assert_called_once_with(0, "pool")
     assert len(failed) == 1
     assert gc.isenabled()
+    request.addfinalizer(gc.enable)
+    gc.disable()
     too_much = mock.Mock(side_effect=torch.cuda.OutOfMemoryError("no room"))
     with pytest.raises(torch.cuda.OutOfMemoryError, match="no room"):  # not the error that follows from it
         record(too_much, torch.device("cuda"))
     assert ended.call_count == len(failed) == 2
+    assert not gc.isenabled()
 
 
 @pytest.mark.gpu

@@ -8,8 +8,8 @@ import torch
 from pytorch_msssim import SSIM
 
 from sundae_ns.core.camera import Camera
-from sundae_ns.core.errors import BackendError, SundaeError
-from sundae_ns.cuda import adam, loss, sweep
+from sundae_ns.core.errors import BackendError
+from sundae_ns.cuda import adam, kernels, loss, sweep
 from sundae_ns.cuda.kernels import kernels_where_possible
 from sundae_ns.cuda.loss import fused_loss
 from sundae_ns.train import plane_sweep
@@ -36,6 +36,11 @@ def test_missing_kernels_are_reported_once(caplog):
 
     assert [kernels_where_possible(refuse, torch.device("cuda"), "it is slow") for _ in range(2)] == [None, None]
     assert caplog.text.count("it is slow, on cuda: NVRTC fails") == 1
+
+
+def test_a_number_beyond_32_bits_is_refused():
+    with pytest.raises(BackendError, match="got 2,147,483,648"):
+        kernels._as_c(2**31, torch.device("cpu"))
 
 
 def test_adam_follows_torch():
@@ -153,8 +158,9 @@ def test_small_losses_are_accurate():
 
 def test_no_second_gradient_and_none_for_the_target():
     image, target = (value.requires_grad_() for value in images(20, 30))
-    with pytest.raises(SundaeError, match="no second derivative"):
-        torch.autograd.grad(fused_loss(image, target, 0.2)[0], image, create_graph=True)
+    (gradient,) = torch.autograd.grad(fused_loss(image, target, 0.2)[0].square(), image, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        gradient.sum().backward()
     assert not fused_loss(image.detach(), target, 0.2)[0].requires_grad
 
 

@@ -72,6 +72,14 @@ def gradients(head, images, grad_out, *, kernels=False):
     return [out.detach(), *grads, *(p.grad.clone() for p in head.parameters() if p.grad is not None)]
 
 
+def test_a_second_derivative_is_refused():
+    net, (_, seen, alpha) = make().net, splatted(8, 8, 5)
+    image = fused.correction(net, True, seen.requires_grad_(), alpha, torch.float32)
+    (gradient,) = torch.autograd.grad(image.square().sum(), seen, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        gradient.sum().backward()
+
+
 KINDS = [{"mode": mode, "pixel_unshuffle": fold} for mode in ("residual", "features") for fold in (1, 2, 3, 4)]
 
 
