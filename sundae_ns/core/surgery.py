@@ -160,8 +160,8 @@ def grow(params: Params, optimizers: Optimizers, count: int, min_opacity: float)
     while count > 0:
         opacities = params["opacities"].detach().sigmoid().flatten()
         rows = opacities.sort(descending=True, stable=True).indices[:count]
-        old = opacities[rows].double()
-        new = 1 - (1 - old).sqrt()
+        old = opacities[rows].double().clamp_min(1e-300)
+        new = -torch.expm1(torch.log1p(-old) / 2)  # 1 - sqrt(1 - o), without a difference that may round to 0
         params["scales"].data[rows] += (old / (2 * new - new.square() / 2**0.5)).log().to(params["scales"])[:, None]
         limited = new.to(opacities).clamp(min_opacity, 1 - torch.finfo(opacities.dtype).eps)
         params["opacities"].data[rows] = torch.logit(limited)[:, None]

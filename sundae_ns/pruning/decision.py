@@ -66,7 +66,8 @@ def decide(
 
     Gaussians without a meaning go first (``gaussians.sanitise``); if all others stay, nothing is scored. A rule that
     ``uses_contribution`` needs one ``[N]``, by :func:`sundae_ns.scene.render.contribution`; ``graph`` is built if not
-    given. ``ConfigError`` for an invalid option or without a contribution, ``DataError`` if no Gaussian is finite.
+    given. ``ConfigError`` for an invalid option or without a contribution, ``DataError`` for a ``count`` below 1, or
+    without a finite Gaussian.
     """
     rule.validate()
     sanitised = sanitise(params)
@@ -74,6 +75,8 @@ def decide(
     n, n_finite = len(finite), usable.num_gaussians
     if n_finite == 0:
         raise diverged(n)
+    if count < 1:
+        raise DataError(f"cannot keep {count} of {n_finite} Gaussians: ask for 1 to {n_finite}")
     if count >= n_finite:
         return Decision(finite, n_finite, n - n_finite, values=dict(usable) if sanitised.clamped else None)
 

@@ -26,6 +26,8 @@ def _distances(points: Tensor, others: Tensor, nth: int = 1) -> Tensor:
     """Distance of each point ``[N, 3]`` to the nth nearest of some others ``[M, 3]``, infinite without: ``[N]``."""
     if len(others) < nth or not len(points):
         return points.new_full((len(points),), torch.inf)
+    # From one of them, because cdist squares coordinates, whose digits a scene far from the origin would take.
+    points, others = points - others[0], others - others[0]
     nearest = (torch.cdist(rows, others).topk(nth, largest=False).values for rows in points.split(1 << 14))
     return torch.cat([distances[:, -1] for distances in nearest])
 

@@ -1,9 +1,9 @@
 """Exact selection: turn scores into a mask that keeps exactly a given number of Gaussians.
 
-Both functions take scores ``[N]`` of any floating dtype on any device, and return a bool mask ``[N]`` on that device
-with exactly ``count`` True entries. Among equal scores the lower index is selected first. NaN means "unknown" and is
-selected last; ``+inf`` is the highest score. All work is done on the CPU in float64, so the same scores give the same
-mask on every device.
+Both functions take scores ``[N]`` of any floating dtype on any device and a ``count`` from 1 to N. They return a bool
+mask ``[N]`` on that device with exactly ``count`` True entries. Among equal scores the lower index is selected first.
+NaN means "unknown" and is selected last; ``+inf`` is the highest score. All work is done on the CPU in float64, so the
+same scores give the same mask on every device.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sundae_ns.core.errors import DataError
 from sundae_ns.graph.neighbors import build_tree
 
 LEAST_SHARE = 1e-200  # least score of a systematic sample, as a share of the largest; lower scores are raised to it
@@ -21,9 +20,9 @@ def select_band(magnitude: Tensor, count: int, gamma: float) -> Tensor:
     """Select the ``round(gamma * count)`` highest magnitudes, and the lowest for the rest; the ends never overlap.
 
     The paper's rule (paragraph "Controlling bandwidth with gamma"). NaN magnitudes, those of isolated Gaussians, belong
-    to neither end. ``DataError`` for a ``count`` that is not in 1 to N.
+    to neither end.
     """
-    values = as_scores(magnitude, count)
+    values = _on_cpu(magnitude)
     mask = torch.zeros(len(values), dtype=torch.bool)
     mask[_ranked(values)[: round(gamma * count)]] = True
     others = (~mask).nonzero().squeeze(1)
@@ -33,7 +32,7 @@ def select_band(magnitude: Tensor, count: int, gamma: float) -> Tensor:
 
 def inclusion_probabilities(score: Tensor, count: int) -> Tensor:
     """Probabilities ``min(1, c s_i)`` of positive finite scores ``[N]``, which sum to ``count``; exactly 1 or below."""
-    values = score.detach().to(device="cpu", dtype=torch.float64)
+    values = _on_cpu(score)
     # The largest is 1, so that sums do not overflow; none is 0, so that no sum is.
     values = (values / values.max()).clamp_min(LEAST_SHARE)
     ordered = torch.sort(values, descending=True, stable=True).values
@@ -57,12 +56,10 @@ def select_systematic(score: Tensor, count: int, order: Tensor, seed: int) -> Te
     Gaussian is selected whenever the sum passes ``u + j``, with one random u for all j. Each Gaussian is selected with
     probability ``min(1, c s_i)``, and any stretch of the order keeps its expected number, rounded up or down. Infinite
     scores are selected first, then positive ones. Scores that are NaN or at most 0 are drawn uniformly, after all
-    others. The mask, bool ``[N]``, has ``count`` entries; ``DataError`` unless that is 1 to N.
+    others.
     """
-    if order.shape != score.shape:
-        raise DataError(f"scores have shape {list(score.shape)} and their order {list(order.shape)}: pass [N] and [N]")
     order = order.cpu()
-    values = as_scores(score, count)[order]
+    values = _on_cpu(score)[order]
     start = float(torch.rand((), generator=torch.Generator().manual_seed(seed), dtype=torch.float64))
     chosen = torch.zeros(len(values), dtype=torch.bool)
     infinite = values == torch.inf
@@ -95,12 +92,7 @@ def _systematic_sample(probabilities: Tensor, count: int, start: float) -> Tenso
     return torch.cat([taken, uncertain[drawn]])
 
 
-def as_scores(score: Tensor, count: int) -> Tensor:
-    """Scores as float64 on the CPU ``[N]``; DataError if they have another shape or ``count`` is not in 1 to N."""
-    if score.ndim != 1:
-        raise DataError(f"scores have shape {list(score.shape)}: pass one number per Gaussian, [N]")
-    if not 1 <= count <= len(score):
-        raise DataError(f"cannot keep {count} of {len(score)} Gaussians: ask for 1 to {len(score)}")
+def _on_cpu(score: Tensor) -> Tensor:
     return score.detach().to(device="cpu", dtype=torch.float64)
 
 

@@ -190,7 +190,7 @@ def test_copies_render_like_the_original(opacity):
 def test_growing_adds_the_exact_number_upon_the_most_opaque(count):
     params, optimizers = gaussians(30)
     train(params, optimizers)
-    params["opacities"].data[7] = 40.0  # 1 in float32, whose logit is infinite
+    params["opacities"].data[7:9] = torch.tensor([[40.0], [-110.0]])  # 1 in float32, whose logit is infinite, and 0
     old, before = params["means"].detach().clone(), moments(optimizers, params, "features").clone()
     opaque = params["opacities"].detach().flatten().argsort(descending=True)
     grow(params, optimizers, count, 0.005)

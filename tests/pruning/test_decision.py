@@ -306,6 +306,7 @@ def test_invalid_input_raises_one_line():
         (ConfigError, "num_neighbors is 0: use at least 1", lambda: draws(num_neighbors=0)),
         (ConfigError, "gamma", lambda: decide(params, spoilt, 6)),
         (DataError, r"score has shape \[3\] for 60", lambda: decide(params, three, 6)),
+        *((DataError, "cannot keep 0 of 60", lambda r=r: decide(params, r, 0, torch.ones(60))) for r in RULES.values()),
     ]
     for error, message, call in cases:
         with pytest.raises(error, match=f"^.*{message}.*$"):

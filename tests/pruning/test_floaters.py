@@ -26,15 +26,16 @@ def test_a_primitive_is_a_floater_where_the_points_say_that_nothing_is():
     assert near_cameras(means, eyes, points).tolist() == [True, True, False, False, False]
 
 
-@pytest.mark.parametrize("scale", [1e-3, 1e6])
-def test_the_unit_of_length_does_not_matter(scale):
+@pytest.mark.parametrize(("scale", "shift"), [(1e-3, 0), (1e6, 0), (1, 2**12)])
+def test_unit_and_origin_do_not_matter(scale, shift):
     eyes, points = scene()
     means = 3 * torch.rand(500, 3, generator=torch.Generator().manual_seed(1)) + 1
     means[0], points[:3] = eyes[0] - torch.tensor([[1.8, 0, 0], [2.5, 0, 0]])
+    eyes, points, means = ((value * 2**10).round() / 2**10 for value in (eyes, points, means))  # float32 moves them
     found = near_cameras(means, eyes, points)
     assert not found[0], "three points show it"
     assert 0 < found.sum() < 500
-    assert torch.equal(near_cameras(scale * means, scale * eyes, scale * points), found)
+    assert torch.equal(near_cameras(*(scale * value + shift for value in (means, eyes, points))), found)
 
 
 def test_a_few_wrong_points_do_not_hide_floaters_and_nan_does_not_count():

@@ -7,7 +7,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sundae_ns.core.errors import DataError
 from sundae_ns.pruning import selection
 from sundae_ns.pruning.rule import kept_count
 from sundae_ns.pruning.selection import inclusion_probabilities, neighbor_order, select_band, select_systematic
@@ -110,26 +109,3 @@ def test_the_order_walks_through_small_clusters_too():
     assert int((steps > 1).sum()) <= 32
     # Among 512 points in a cube of 1e-2, neighbours are about 7e-4 apart, and random pairs 6.6e-3.
     assert steps[steps < 1].mean() < 3.5e-3
-
-
-@pytest.mark.parametrize(
-    ("scores", "count", "order", "words"),
-    [
-        (torch.ones(3), 5, 3, "cannot keep 5 of 3"),
-        (torch.ones(3), 0, 3, "cannot keep 0 of 3"),
-        (torch.ones(3), 1, 2, r"\[3\] and their order \[2\]"),
-        (torch.ones(3, 2), 1, None, "one number per Gaussian"),
-        (torch.ones(3), -1, None, "cannot keep -1 of 3"),
-    ],
-)
-def test_invalid_input_is_refused(scores, count, order, words):
-    with pytest.raises(DataError, match=words):
-        _ = select_systematic(scores, count, torch.arange(order), 0) if order else select_band(scores, count, 0.5)
-
-
-@pytest.mark.gpu
-def test_masks_are_the_same_on_every_device():
-    score, order = torch.rand(1000, generator=torch.Generator().manual_seed(0)), torch.randperm(1000)
-    for select in (lambda s: select_band(s, 99, 0.4), lambda s: select_systematic(s, 99, order, 3)):
-        assert select(score.cuda()).is_cuda
-        assert torch.equal(select(score.cuda()).cpu(), select(score))
