@@ -19,7 +19,7 @@ name               shape           meaning
 from __future__ import annotations
 
 from collections import UserDict
-from collections.abc import Mapping, MutableMapping
+from collections.abc import Mapping, MutableMapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -134,6 +134,15 @@ class Gaussians(UserDict[str, Any]):
         if self.encoding == "harmonics":
             return self
         return Gaussians({**self, "features_dc": rgb_to_sh(self["features_dc"].detach().sigmoid())}, "harmonics")
+
+
+def concatenated(parts: Sequence[Mapping[str, Tensor]], names: Sequence[str] = SPLAT_NAMES) -> dict[str, Tensor]:
+    """Parameters of the Gaussians of one or more parts ``[N, ...]``, by name; missing SH degrees are zero."""
+    most = max(part["features_rest"].shape[1] for part in parts)
+    values = {name: [part[name] for part in parts] for name in names}
+    rows = values["features_rest"]
+    values["features_rest"] = [torch.nn.functional.pad(rest, (0, 0, 0, most - rest.shape[1])) for rest in rows]
+    return {name: torch.cat(of_parts) for name, of_parts in values.items()}
 
 
 def as_gaussians(params: Mapping[str, Any]) -> Gaussians:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from io import BufferedIOBase
 from typing import IO, Any
 
-from sundae_ns.core.gaussians import sh_degree_of
+from torch import Tensor
+
+from sundae_ns.core.gaussians import concatenated, num_gaussians, sh_degree_of
 
 SPARE, RATIO = 64 << 20, 32  # bytes, and bytes for each byte of the file; a real .sog has 24, a .spz 12
 _MOST_JSON = 8 << 20
@@ -23,6 +26,13 @@ def afford_gaussians(count: int, coefficients: int, size: int) -> None:
     if count < 1 or sh_degree_of(coefficients) is None:
         raise ValueError(f"it states {count:,} Gaussians of {coefficients} SH coefficients")
     afford(4 * count * (14 + 3 * coefficients), size)
+
+
+def joined(parts: Sequence[Mapping[str, Tensor]], size: int) -> dict[str, Tensor]:
+    """The Gaussians of all parts of a file of ``size`` bytes, by :func:`concatenated`; ``ValueError`` for none."""
+    most = max((part["features_rest"].shape[1] for part in parts), default=0)
+    afford_gaussians(sum(map(num_gaussians, parts)), most, size)
+    return concatenated(parts) if len(parts) > 1 else dict(parts[0])
 
 
 def read_exactly(stream: IO[bytes] | BufferedIOBase, size: int) -> bytes:

@@ -42,7 +42,7 @@ def rotate_spherical_harmonics(features_rest: Tensor, rotation: Tensor) -> Tenso
     directions = torch.nn.functional.normalize(torch.randn(64, 3, generator=generator, dtype=torch.float64), dim=1)
     after = harmonic_basis(max_degree, directions @ rotation.double().cpu().mT)
     before = harmonic_basis(max_degree, directions).expand_as(after)
-    rotated = features_rest.repeat(*rotation.shape[:-2], 1, 1, 1)
+    rotated = features_rest.new_empty(*rotation.shape[:-2], *features_rest.shape)
     for degree in range(1, max_degree + 1):
         columns = slice(degree**2, (degree + 1) ** 2)
         matrix = torch.linalg.lstsq(after[..., columns], before[..., columns]).solution.round(decimals=12)

@@ -32,10 +32,9 @@ from sundae_ns.core.covariance import rotation_matrices
 from sundae_ns.core.errors import DataError, reading, regular
 from sundae_ns.core.files import replacing
 from sundae_ns.core.gaussians import SH_C0, sh_degree
-from sundae_ns.io.budget import afford, afford_gaussians, parsed_json
+from sundae_ns.io.budget import afford, afford_gaussians, joined, parsed_json
 from sundae_ns.io.coordinates import similarity
 from sundae_ns.io.ply import LEAST_OPACITY, UNMARKED, Marks, check_gaussians, checked, vector
-from sundae_ns.io.splat import joined
 from sundae_ns.io.spz import decoded
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -83,18 +82,16 @@ def write_glb(path: Path, params: Mapping[str, Tensor], marks: Marks = UNMARKED)
     stated = {name: value for name, value in zip(_MARKS, marks, strict=True) if value}
     accessors: list[dict[str, Any]] = []
     buffer_views: list[dict[str, int]] = []
-    buffer = bytearray()
     types = {number: name for name, number in _TYPES.items()}
     for name, value in attributes.items():
-        data = value.contiguous().numpy().tobytes()  # a multiple of four bytes
         accessor = {"bufferView": len(accessors), "count": len(value), "type": types[value.shape[1]]}
         is_float = value.is_floating_point()
         accessor |= {"componentType": _FLOAT if is_float else _BYTE, "normalized": not is_float}
         if name == "POSITION":  # as glTF demands
             accessor |= {"min": value.amin(dim=0).tolist(), "max": value.amax(dim=0).tolist()}
         accessors.append(accessor)
-        buffer_views.append({"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data), "target": _ARRAY_BUFFER})
-        buffer += data
+        start = sum(view["byteLength"] for view in buffer_views)  # a multiple of four bytes
+        buffer_views.append({"buffer": 0, "byteOffset": start, "byteLength": value.nbytes, "target": _ARRAY_BUFFER})
     look = {"kernel": "ellipse", "colorSpace": _SRGB, "projection": "perspective", "sortingMethod": "cameraDistance"}
     indices = {name: i for i, name in enumerate(attributes)}
     document = {
@@ -106,13 +103,14 @@ def write_glb(path: Path, params: Mapping[str, Tensor], marks: Marks = UNMARKED)
         "meshes": [{"primitives": [{"attributes": indices, "mode": _POINTS, "extensions": {EXTENSION: look}}]}],
         "accessors": accessors,
         "bufferViews": buffer_views,
-        "buffers": [{"byteLength": len(buffer)}],
+        "buffers": [{"byteLength": size}],
     }
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
-    chunks: list[bytes | bytearray] = [_CHUNK.pack(len(text), _JSON), text, _CHUNK.pack(len(buffer), _BINARY), buffer]
+    front = _CHUNK.pack(len(text), _JSON) + text + _CHUNK.pack(size, _BINARY)
     with replacing(path) as partial, partial.open("wb") as file:
-        file.writelines([_HEADER.pack(b"glTF", 2, _HEADER.size + sum(map(len, chunks))), *chunks])
+        file.write(_HEADER.pack(b"glTF", 2, _HEADER.size + len(front) + size) + front)
+        file.writelines(value.contiguous().numpy().data for value in attributes.values())
 
 
 def read_glb(path: Path) -> tuple[dict[str, Tensor], Marks]:
@@ -144,7 +142,7 @@ def read_glb(path: Path) -> tuple[dict[str, Tensor], Marks]:
         if not parts:
             raise ValueError(f"no mesh of its scene has {EXTENSION}")
         marks = Marks(antialiased, in_model_frame, up, offset)
-        return similarity(joined(parts), _FROM_MODEL if in_model_frame else _FROM_PLY, 1.0), marks
+        return similarity(joined(parts, path.stat().st_size), _FROM_MODEL if in_model_frame else _FROM_PLY, 1.0), marks
 
 
 def _chunks(path: Path) -> tuple[dict[str, Any], memoryview]:

@@ -38,6 +38,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sundae_ns.core.covariance import chunks
 from sundae_ns.core.errors import DataError, reading, regular
 from sundae_ns.core.files import replacing
 from sundae_ns.core.gaussians import SPLAT_NAMES, odd_shapes, rgb_to_sh, sh_degree_of, sh_to_rgb
@@ -125,13 +126,14 @@ def checked(path: Path, params: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return gaussians
 
 
-def _table(params: Mapping[str, Tensor]) -> tuple[list[str], NDArray[np.float32]]:
-    """Properties of Gaussians but the normals, and their values ``[N, C]``, in the order of the format."""
+def _table(params: Mapping[str, Tensor], normals: tuple[str, ...] = ()) -> tuple[list[str], NDArray[np.float32]]:
+    """Properties of Gaussians and their values ``[N, C]``, in the order of the format; ``normals`` are zero."""
     values = {name: params[name].detach().to("cpu", torch.float32).numpy() for name in SPLAT_NAMES}
     n, width = len(values["means"]), 3 * values["features_rest"].shape[1]
     values["features_rest"] = values["features_rest"].transpose(0, 2, 1).reshape(n, width)
-    columns = {**_COLUMNS, "features_rest": tuple(f"f_rest_{i}" for i in range(width))}
-    order = ("means", "features_dc", "features_rest", "opacities", "scales", "quats")
+    values["normals"] = np.zeros((n, len(normals)), np.float32)
+    columns = {**_COLUMNS, "normals": normals, "features_rest": tuple(f"f_rest_{i}" for i in range(width))}
+    order = ("means", "normals", "features_dc", "features_rest", "opacities", "scales", "quats")
     names = [column for name in order for column in columns[name]]
     return names, np.concatenate([values[name] for name in order], axis=1)
 
@@ -143,14 +145,12 @@ def write_ply(path: Path, params: Mapping[str, Tensor], *, comments: Sequence[st
     (``finite_mask``), because viewers do not. ``comments`` are lines for the header (:func:`comments_of`).
     ``StorageError`` if the disk is full or not writable.
     """
-    names, table = _table(params)
-    names[3:3] = ("nx", "ny", "nz")
-    table = np.insert(table, [3, 3, 3], 0, axis=1).astype("<f4", copy=False)
+    names, table = _table(params, ("nx", "ny", "nz"))
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
     header += [f"element vertex {len(table)}", *(f"property float {name}" for name in names), "end_header", ""]
     with replacing(path) as partial, partial.open("wb") as file:
         file.write("\n".join(header).encode())
-        file.write(np.ascontiguousarray(table).data)
+        file.write(table.astype("<f4", copy=False).data)
 
 
 def keep_vertices(
@@ -308,9 +308,10 @@ def comments_of(marks: Marks) -> list[str]:
 def _columns(rows: Any, names: Sequence[str], dtype: Any = np.float32) -> Tensor:
     """Properties of vertices as columns ``[N, len(names)]``."""
     table = np.empty((len(rows), len(names)), dtype)
-    for i, name in enumerate(names):
-        with np.errstate(over="ignore"):  # values beyond float32 become infinite; callers drop them
-            table[:, i] = rows[name]
+    with np.errstate(over="ignore"):  # values beyond float32 become infinite; callers drop them
+        for some in chunks(len(rows), 1 << 14):  # that stay in the processor's cache from column to column
+            for i, name in enumerate(names):
+                table[some, i] = rows[some][name]
     return torch.from_numpy(table)
 
 

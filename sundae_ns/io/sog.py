@@ -47,7 +47,7 @@ from torch import Tensor
 from sundae_ns.core.covariance import entries_of
 from sundae_ns.core.errors import DataError, reading, regular
 from sundae_ns.core.files import replacing, write_files, write_text
-from sundae_ns.io.budget import afford, afford_gaussians, parsed_json, read_exactly
+from sundae_ns.io.budget import afford, afford_gaussians, joined, parsed_json, read_exactly
 from sundae_ns.io.coordinates import scene_order
 from sundae_ns.io.ply import ANTIALIASED, UNMARKED, Marks, check_gaussians, checked, from_smallest_three, vector
 
@@ -227,11 +227,7 @@ def _finest_level(path: Path, entry: Entry, size: int) -> tuple[dict[str, Tensor
                 raise ValueError(f"leaves share Gaussians of {file}, or it has fewer")
             rows[offset : offset + count] = True
         parts.append({name: value[rows] for name, value in part.items()})
-    most = max(part["features_rest"].shape[1] for part in parts)
-    for part in parts:
-        rest = part["features_rest"]
-        part["features_rest"] = torch.nn.functional.pad(rest, (0, 0, 0, most - rest.shape[1]))
-    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}, marks
+    return joined(parts, size), marks
 
 
 def _file_entry(folder: Path, name: str) -> bytes:

@@ -33,6 +33,7 @@ from torch import Tensor
 
 from sundae_ns.core.errors import reading, regular
 from sundae_ns.core.gaussians import SPLAT_NAMES, rgb_to_sh
+from sundae_ns.io.budget import joined
 from sundae_ns.io.checkpoint import check_whole, load_tensors
 from sundae_ns.io.ply import LEAST_OPACITY, UNMARKED, Marks, check_gaussians
 
@@ -51,15 +52,6 @@ def _gaussians(rows: NDArray[Any], means: NDArray[Any], quats: NDArray[Any], res
     params["features_dc"] = rgb_to_sh(colors[:, :3])
     params["opacities"] = torch.logit(colors[:, 3:], eps=LEAST_OPACITY)
     return params
-
-
-def joined(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:
-    """The Gaussians of all parts; ``ValueError`` if there are none, or if they differ in their SH degree."""
-    if not (parts := [part for part in parts if len(part["means"])]):
-        raise ValueError("it has no Gaussians")
-    if len({part["features_rest"].shape[1:] for part in parts}) > 1:
-        raise ValueError("its parts have different SH degrees")
-    return {name: torch.cat([part[name] for part in parts]) for name in SPLAT_NAMES}
 
 
 def read_splat(path: Path) -> tuple[dict[str, Tensor], Marks]:
@@ -91,7 +83,7 @@ def read_ksplat(path: Path) -> tuple[dict[str, Tensor], Marks]:
             section = _SECTION.unpack_from(data, _HEADER_BYTES + i * _SECTION_BYTES)
             part, start = _section(data, start, level, (low or -1.5, high or 1.5), section)
             parts.append(part)
-        return joined(parts), UNMARKED
+        return joined(parts, len(data)), UNMARKED
 
 
 def _section(
@@ -141,7 +133,7 @@ def read_gsplat(path: Path) -> tuple[dict[str, Tensor], Marks]:
             check_whole(file)
             parts.append(_trained(load_tensors(file)))
     with reading(path, "a checkpoint of gsplat", remedy="give another file"):
-        return joined(parts), UNMARKED
+        return joined(parts, sum(each.stat().st_size for each in rank_files(path))), UNMARKED
 
 
 def _trained(loaded: Any) -> dict[str, Tensor]:

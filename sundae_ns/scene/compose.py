@@ -10,12 +10,11 @@ from collections.abc import Iterable, Sequence
 import torch
 from rich.console import Console
 from torch import Tensor
-from torch.nn.functional import pad
 
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.covariance import rotation_matrices
 from sundae_ns.core.errors import ConfigError, DataError
-from sundae_ns.core.gaussians import FEATURES, Gaussians, sanitise
+from sundae_ns.core.gaussians import FEATURES, Gaussians, concatenated, sanitise
 from sundae_ns.core.values import AnyArray, numbers, positions
 from sundae_ns.head.head import CompensationHead
 from sundae_ns.io.coordinates import similarity
@@ -118,13 +117,10 @@ def merge(scenes: Iterable[Scene]) -> Scene:
     scenes = [aligned(scene, first) for scene in scenes]
     alike = len({scene.gaussians.encoding for scene in scenes}) == 1
     parts = [(scene.gaussians if alike else scene.gaussians.as_harmonics()).to(first.device) for scene in scenes]
-    most = max(part["features_rest"].shape[1] for part in parts)
     names = [name for name in first.gaussians if name != FEATURES or first.head is not None]
-    rest = [pad(part["features_rest"], (0, 0, 0, most - part["features_rest"].shape[1])) for part in parts]
-    parts = [part.replaced({"features_rest": value}) for part, value in zip(parts, rest, strict=True)]
     return dataclasses.replace(
         first,
-        gaussians=Gaussians({name: torch.cat([part[name] for part in parts]) for name in names}, parts[0].encoding),
+        gaussians=Gaussians(concatenated(parts, names), parts[0].encoding),
         cameras=tuple(dict.fromkeys(camera for scene in scenes for camera in scene.cameras)),  # parts share theirs
         up=first.up or next((scene.up for scene in scenes if scene.up), None),
     )

@@ -136,10 +136,9 @@ def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -
         degree = int(loaded["step"]) // max(interval, 1)  # training did not reach higher ones
         gaussians["features_rest"] = gaussians["features_rest"][:, : (degree + 1) ** 2 - 1]
     gaussians = formats.usable(gaussians, source).gaussians
-    frame = None
-    with suppress(DataError, KeyError, TypeError, ValueError):
-        stated = read_json(config.parent / FRAME_FILE)
-        frame = {"transform": stated["transform"], "scale": float(stated["scale"])}
+    frame: dict[str, Any] = {}
+    with suppress(DataError):
+        frame = read_json(config.parent / FRAME_FILE)
     return Scene(
         gaussians,
         head,

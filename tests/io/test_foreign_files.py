@@ -179,9 +179,8 @@ HOSTILE_KSPLATS = {
     "another level": ([(20, "<H", 3)], "level 3"),
     "sections beyond all": ([(4, "<I", 2**32 - 1), (8, "<I", 2**32 - 1)], "buffer"),
     "more sections used than stored": ([(8, "<I", 3)], "not version"),
-    "no sections": ([(8, "<I", 0)], "it has no Gaussians"),
+    "no sections": ([(8, "<I", 0)], "it states 0 Gaussians"),
     "an odd SH degree": ([(SECTION + 40, "<H", 3)], "do not fit together"),
-    "different SH degrees": ([(SECTION + 1024, "<I", 5), (SECTION + 1024 + 40, "<H", 1)], "different SH degrees"),
     "Gaussians beyond all": ([(SECTION, "<I", 2**32 - 1), (SECTION + 4, "<I", 2**32 - 1)], "buffer"),
     "more Gaussians used than stored": ([(SECTION, "<I", 17)], "do not fit together"),
     "buckets beyond all": ([(SECTION + 12, "<I", 2**32 - 1), (SECTION + 32, "<I", 2**32 - 3)], "together|buffer"),
@@ -199,6 +198,13 @@ def test_hostile_ksplats_are_refused_in_one_line(tmp_path, kind):
     changes, words = HOSTILE_KSPLATS[kind]
     path = changed(tmp_path / "a.ksplat", changes)
     refused(sn.load, path, rf"a\.ksplat is not a complete \.ksplat .*({words})")
+
+
+def test_sections_of_a_ksplat_may_have_other_sh_degrees(tmp_path):
+    path = changed(tmp_path / "a.ksplat", [(SECTION + 1024, "<I", 5), (SECTION + 1024 + 40, "<H", 1)])
+    rest = read_ksplat(path)[0]["features_rest"]
+    assert rest[:-5, 3:].any()
+    assert not rest[-5:, 3:].any()
 
 
 def test_unstated_bounds_of_a_ksplat_and_ranges_are_those_of_its_viewer(tmp_path):
