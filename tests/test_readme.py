@@ -59,24 +59,22 @@ def test_scripts_and_targets_exist():
     assert [target for target in targets if not re.search(rf"^{target}:", makefile, re.MULTILINE)] == []
 
 
+def test_named_tests_exist_and_every_results_file_is_named():
+    text = "".join(path.read_text(encoding="utf-8") for path in TEXTS)
+    assert set(re.findall(r"`(test_\w+)", text)) <= {path.stem for path in (ROOT / "tests").rglob("test_*.py")}
+    scripts = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "benchmarks").glob("*.py"))
+    results = ROOT / "benchmarks" / "results"
+    assert [path.name for path in results.iterdir() if path.name not in text + scripts] == []
+
+
 METHOD = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
 NAME = re.compile(r"`(sundae_ns(?:\.\w+)+)`")
 EQUATION = re.compile(r"```math\n(.*?)```\n", re.DOTALL)
 
 
-def function_of(name):
-    """What a dotted name stands for; modules come before things of the same name in their package."""
-    module, _, rest = name.rpartition(".")
-    try:
-        return pkgutil.resolve_name(f"{module}:{rest}")
-    except ModuleNotFoundError:  # a method of a class
-        module, _, owner = module.rpartition(".")
-        return pkgutil.resolve_name(f"{module}:{owner}.{rest}")
-
-
 @pytest.mark.parametrize("name", sorted(set(NAME.findall(METHOD))))
 def test_every_function_of_the_method_exists(name):
-    assert callable(function_of(name))
+    assert callable(pkgutil.resolve_name(name))
 
 
 def test_every_equation_has_its_function_and_is_rendered_by_github():
