@@ -126,15 +126,15 @@ def rank_ended(error: BaseException) -> str:
     return f"rank {rank} ended ({f'killed by {signal}' if signal else last}) and stopped the others; {remedy}"
 
 
-def out_of_memory(error: BaseException, primitives: int) -> MemoryExhaustedError:
+def out_of_memory(error: BaseException, num_gaussians: int) -> MemoryExhaustedError:
     """The error for a full CUDA device: the number of Gaussians, the allocation that failed, and what to try."""
     allocation = re.search(r"[Tt]ried to allocate ([\d.]+ \w+)", str(error))
     return MemoryExhaustedError(
         f"the GPU's memory is full: cannot allocate {f'{allocation[1]} ' if allocation else ''}more with "
-        f"{primitives:,} Gaussians; try --pipeline.datamanager.cache-images cpu (images in host memory), "
+        f"{num_gaussians:,} Gaussians; try --pipeline.datamanager.cache-images cpu (images in host memory), "
         "--pipeline.datamanager.camera-res-scale-factor 0.5 (smaller images), or "
         "--pipeline.model.pruning.mode continuous --pipeline.model.pruning.keep-ratio 0.5 "
-        f"--pipeline.model.pruning.max-gaussians {max(primitives // 2, 1)} (a lower peak); "
+        f"--pipeline.model.pruning.max-gaussians {max(num_gaussians // 2, 1)} (a lower peak); "
         "--load-dir resumes from the last checkpoint"
     )
 

@@ -130,7 +130,7 @@ class Gaussians(UserDict[str, Any]):
         return self.replaced({name: value.to(device) for name, value in self.items()})
 
     def as_harmonics(self) -> Gaussians:
-        """The Gaussians with colours as spherical harmonics; itself if they are stored so."""
+        """The Gaussians with colours as spherical harmonics, detached; itself if they are stored so."""
         if self.encoding == "harmonics":
             return self
         return Gaussians({**self, "features_dc": rgb_to_sh(self["features_dc"].detach().sigmoid())}, "harmonics")

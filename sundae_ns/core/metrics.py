@@ -20,7 +20,7 @@ SSIM_WINDOW = 11  # side of SSIM's Gaussian window, pixels (Wang et al. 2004)
 MOST_PSNR = 100.0  # highest PSNR that a decision or a fit of colours gives, dB; 8-bit images carry no more
 AnyCamera = TypeVar("AnyCamera")
 Net = Literal["alex", "vgg", "squeeze"]
-logger = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 def check_pair(pred: Tensor, target: Tensor) -> None:
@@ -102,7 +102,7 @@ class Lpips:
             except Exception as error:  # network, disk or a damaged file: a missing metric must not end a run
                 self._failed = True
                 cause = f"its {self.net} weights are missing ({one_line(error)})"
-                logger.warning("LPIPS is left out because %s; put %s into %s.", cause, url, path.parent)
+                _log.warning("LPIPS is left out because %s; put %s into %s.", cause, url, path.parent)
                 return None
         # Calling the metric returns the value of this pair alone; earlier calls do not count.
         return self._metric.to(pred.device)(*(x.float().clamp(0, 1).permute(2, 0, 1)[None] for x in (pred, target)))

@@ -7,8 +7,8 @@
 
 struct __align__(16) Shape {
     float x, y, opacity, a, b, c;  // the exponent is a dx^2 + 2 b dx dy + c dy^2
-    int primitive;
-    unsigned warps;  // a bit for each warp with pixels that may blend the primitive
+    int gaussian;
+    unsigned warps;  // a bit for each warp with pixels that may blend the Gaussian
 };
 
 // A part of a tile's list, which the threads of a block read together.
@@ -49,7 +49,7 @@ struct Pixel {
     bool inside;
 };
 
-// Pixels of a warp form a block, because most primitives are as wide as high.
+// Pixels of a warp form a block, because most Gaussians are as wide as high.
 __device__ __forceinline__ Pixel pixel_of(int tile, int number, int width, int height) {
     const int columns = (width + TILE - 1) / TILE, warp = number / (WIDE * HIGH), place = number % (WIDE * HIGH);
     const int x = tile % columns * TILE + warp % ACROSS * WIDE + place % WIDE;
@@ -58,7 +58,7 @@ __device__ __forceinline__ Pixel pixel_of(int tile, int number, int width, int h
     return pixel;
 }
 
-// Alpha before it is limited, or 0 where the primitive is too faint to be blended.
+// Alpha before it is limited, or 0 where the Gaussian is too faint to be blended.
 __device__ __forceinline__ float falloff(const Shape& s, float dx, float dy) {
     const float exponent = s.a * dx * dx + s.c * dy * dy + 2 * s.b * dx * dy;
     return exponent < 0 ? 0 : __expf(-exponent);
@@ -66,7 +66,7 @@ __device__ __forceinline__ float falloff(const Shape& s, float dx, float dy) {
 
 // One block blends one tile.
 extern "C" __global__ void blend(LISTS, FIELD, float* __restrict__ image,
-                                 float* __restrict__ alphas, float* __restrict__ lefts,
+                                 float* __restrict__ alphas, float* __restrict__ transmittances,
                                  int* __restrict__ stops) {
     __shared__ Batch batch;
     const int tile = blockIdx.x;
@@ -106,7 +106,7 @@ extern "C" __global__ void blend(LISTS, FIELD, float* __restrict__ image,
 #pragma unroll
         for (int c = 0; c < CHANNELS; ++c) image[pixel.at * CHANNELS + c] = sums[c];
         alphas[pixel.at] = 1 - through;
-        lefts[pixel.at] = through;
+        transmittances[pixel.at] = through;
         stops[pixel.at] = stop;
     }
 }
@@ -135,7 +135,7 @@ __device__ __forceinline__ void sum_over_lanes(float* values, int lane) {
 #define SHARERS (LANES > SLOTS ? LANES / SLOTS : 1)  // lanes that hold the same sum
 
 // One block goes through one tile from back to front. Gradients are added to their current values.
-extern "C" __global__ void blend_backward(LISTS, FIELD, const float* __restrict__ lefts,
+extern "C" __global__ void blend_backward(LISTS, FIELD, const float* __restrict__ transmittances,
                                           const int* __restrict__ stops, const float* __restrict__ grad_image,
                                           const float* __restrict__ grad_alphas, float* __restrict__ grad_means,
                                           float* __restrict__ grad_conics, float* __restrict__ grad_colors,
@@ -182,7 +182,7 @@ extern "C" __global__ void blend_backward(LISTS, FIELD, const float* __restrict_
         float gradient[CHANNELS];
 #pragma unroll
         for (int c = 0; c < CHANNELS; ++c) gradient[c] = pixel.inside ? grad_image[pixel.at * CHANNELS + c] : 0;
-        const float left = pixel.inside ? lefts[pixel.at] : 0;  // transmittance behind the last primitive
+        const float left = pixel.inside ? transmittances[pixel.at] : 0;  // transmittance behind the last Gaussian
         const float grad_left = pixel.inside ? -grad_alphas[pixel.at] * left : 0;
         float through = left, behind = 0;  // what lies behind, multiplied with the gradient of the pixel
 
@@ -234,7 +234,7 @@ extern "C" __global__ void blend_backward(LISTS, FIELD, const float* __restrict_
                     sum_over_lanes<LANES / 2, SLOTS>(values, lane);
 #pragma unroll
                     for (int n = 0; n < KEPT; ++n)
-                        if (into[n]) atomicAdd(into[n] + (long long)s.primitive * stride[n], values[n]);
+                        if (into[n]) atomicAdd(into[n] + (long long)s.gaussian * stride[n], values[n]);
                 }
             }
         }

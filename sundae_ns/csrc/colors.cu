@@ -9,7 +9,7 @@
     z *= scale; \
     const float xx = x * x, yy = y * y, zz = z * z;
 
-// One thread computes one channel of one primitive. `rest` holds num_rest coefficients of three channels each.
+// One thread computes one channel of one Gaussian. `rest` holds num_rest coefficients of three channels each.
 extern "C" __global__ void harmonic_colors(int n, int degree, const float* __restrict__ means,
                                            const float* __restrict__ center, int center_step,
                                            const float* __restrict__ dc, const float* __restrict__ rest, int num_rest,
@@ -38,7 +38,7 @@ extern "C" __global__ void harmonic_colors(int n, int degree, const float* __res
     out[thread] = sum < 0 ? 0 : sum;  // NaN stays
 }
 
-// One coefficient of a primitive: its gradient takes its place, and its part of the gradient of the direction is added.
+// One coefficient of a Gaussian: its gradient takes its place, and its part of the gradient of the direction is added.
 #define TERM(K, VALUE, DX, DY, DZ)                                                             \
     {                                                                                          \
         const float value = VALUE;                                                             \
@@ -52,7 +52,7 @@ extern "C" __global__ void harmonic_colors(int n, int degree, const float* __res
         dz += weight * (DZ);                                                                   \
     }
 
-// A block computes PER_BLOCK primitives. It reads their coefficients and writes their gradients as one piece.
+// A block computes PER_BLOCK Gaussians. It reads their coefficients and writes their gradients as one piece.
 extern "C" __global__ void harmonic_colors_backward(
     int n, int degree, const float* __restrict__ means, const float* __restrict__ center, int center_step,
     const float* __restrict__ rest, int num_rest, const float* __restrict__ colors, const float* __restrict__ gradient,

@@ -11,7 +11,7 @@ __device__ __forceinline__ int clamped(float value, int most) {
     return value > 0 ? value < most ? (int)value : most : 0;
 }
 
-// Whether no pixel of a tile blends the primitive.
+// Whether no pixel of a tile blends the Gaussian.
 __device__ __forceinline__ bool misses(const Footprint& f, int column, int row, int width, int height) {
     const int wide = width - column * TILE, high = height - row * TILE;
     const float left = column * TILE + 0.5f - f.x, right = left + (wide < TILE ? wide : TILE) - 1;
@@ -79,9 +79,9 @@ __device__ __forceinline__ Footprint footprint(int i, const float* __restrict__ 
     const float* __restrict__ conics, const float* __restrict__ opacities, const int* __restrict__ radii, int axes, \
     int width, int height, int columns, int rows
 
-// The tiles of one thread, which takes every `lanes`-th row of one primitive; primitives are in order of depth.
+// The tiles of one thread, which takes every `lanes`-th row of one Gaussian; Gaussians are in order of depth.
 // Returns the number of tiles; with `tiles`, also writes them from `at` on, up to the capacity.
-__device__ __forceinline__ int walk(FIELD, int thread, TileId* tiles, int* primitives, long long at, int capacity) {
+__device__ __forceinline__ int walk(FIELD, int thread, TileId* tiles, int* gaussians, long long at, int capacity) {
     const int i = (int)order[thread / lanes];
     const Footprint f = footprint(i, means, conics, opacities, radii, axes, columns, rows);
     if (f.first >= f.last) return 0;
@@ -94,7 +94,7 @@ __device__ __forceinline__ int walk(FIELD, int thread, TileId* tiles, int* primi
         else
             for (; from < to && at < capacity; ++from, ++at) {
                 tiles[at] = (TileId)(row * columns + from);
-                primitives[at] = i;
+                gaussians[at] = i;
             }
     }
     return (int)(at - start);
@@ -110,8 +110,8 @@ extern "C" __global__ void count_tiles(FIELD, int* __restrict__ counts) {
 
 // `ends` is the inclusive prefix sum of `counts`.
 extern "C" __global__ void list_tiles(FIELD, const int* __restrict__ counts, const long long* __restrict__ ends,
-                                      int capacity, TileId* __restrict__ tiles, int* __restrict__ primitives) {
+                                      int capacity, TileId* __restrict__ tiles, int* __restrict__ gaussians) {
     const long long thread = blockIdx.x * (long long)blockDim.x + threadIdx.x;
     if (thread < (long long)n * lanes)
-        WALK((int)thread, tiles, primitives, ends[thread] - counts[thread], capacity);
+        WALK((int)thread, tiles, gaussians, ends[thread] - counts[thread], capacity);
 }

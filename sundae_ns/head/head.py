@@ -170,9 +170,9 @@ class CompensationHead(nn.Module):
 def training_crop(width: int, height: int, max_pixels: int, seed: int, *, mirror: bool = False) -> Crop | None:
     """A random window with the image's aspect ratio, pixels, or None to train on the whole image, not mirrored.
 
-    It has at most ``max_pixels``; 0 for no limit. Positions are drawn from beyond the edges too and moved back inside,
-    because uniform ones would rarely include the pixels next to the edges. The window is a function of the seed, so
-    that a resumed run uses the same windows; with ``mirror`` one of two is mirrored.
+    It has at most ``max_pixels``, but sides of at least :data:`GRID`; 0 for no limit. Positions are drawn from beyond
+    the edges too and moved back inside, because uniform ones would rarely include the pixels next to the edges. The
+    window is a function of the seed, as a resumed run uses the same; with ``mirror`` one of two is mirrored.
     """
     fits = max_pixels == 0 or width * height <= max_pixels
     if fits and not mirror:

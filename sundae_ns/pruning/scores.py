@@ -75,7 +75,8 @@ def pixel_detail(image: Tensor, cells: float) -> Tensor:
 
     A Gaussian covers a cell of about ``H W / cells`` pixels, and the deviation within a window of that size is the
     detail that it cannot show. The squared error of n cells is least if their density is proportional to the gradient
-    (minimise ``int |grad f|^2 / density``), and in a smooth image the deviation is proportional to the gradient.
+    (minimise ``int |grad f|^2 / density``), and in a smooth image the deviation is proportional to the gradient. Values
+    are float32 or float64; those that are not finite count as 0 or as the largest number.
     """
     height, width = image.shape[:2]
     side = round((height * width / max(cells, 1.0)) ** 0.5)

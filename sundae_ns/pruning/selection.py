@@ -22,7 +22,7 @@ def select_band(magnitude: Tensor, count: int, gamma: float) -> Tensor:
     The paper's rule (paragraph "Controlling bandwidth with gamma"). NaN magnitudes, those of isolated Gaussians, belong
     to neither end.
     """
-    values = _on_cpu(magnitude)
+    values = magnitude.detach().cpu().double()
     mask = torch.zeros(len(values), dtype=torch.bool)
     mask[_ranked(values)[: round(gamma * count)]] = True
     others = (~mask).nonzero().squeeze(1)
@@ -32,7 +32,7 @@ def select_band(magnitude: Tensor, count: int, gamma: float) -> Tensor:
 
 def inclusion_probabilities(score: Tensor, count: int) -> Tensor:
     """Probabilities ``min(1, c s_i)`` of positive finite scores ``[N]``, which sum to ``count``; exactly 1 or below."""
-    values = _on_cpu(score)
+    values = score.detach().cpu().double()
     # The largest is 1, so that sums do not overflow; none is 0, so that no sum is.
     values = (values / values.max()).clamp_min(LEAST_SHARE)
     ordered = torch.sort(values, descending=True, stable=True).values
@@ -59,7 +59,7 @@ def select_systematic(score: Tensor, count: int, order: Tensor, seed: int) -> Te
     others.
     """
     order = order.cpu()
-    values = _on_cpu(score)[order]
+    values = score.detach().cpu().double()[order]
     start = float(torch.rand((), generator=torch.Generator().manual_seed(seed), dtype=torch.float64))
     chosen = torch.zeros(len(values), dtype=torch.bool)
     infinite = values == torch.inf
@@ -90,10 +90,6 @@ def _systematic_sample(probabilities: Tensor, count: int, start: float) -> Tenso
     drawn = torch.searchsorted(sums, marks, right=True).minimum(steps + len(uncertain) - wanted)
     drawn = (drawn - steps).cummax(0).values + steps
     return torch.cat([taken, uncertain[drawn]])
-
-
-def _on_cpu(score: Tensor) -> Tensor:
-    return score.detach().to(device="cpu", dtype=torch.float64)
 
 
 def _ranked(values: Tensor) -> Tensor:

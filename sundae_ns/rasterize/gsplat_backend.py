@@ -58,7 +58,7 @@ class GsplatBackend:
 
         return rasterize_to_pixels(
             *(splats.means2d, splats.conics, colors, splats.opacities, lists.width, lists.height, TILE),
-            *(lists.starts, lists.primitives),
+            *(lists.starts, lists.gaussians),
             masks=lists.drawn,
             absgrad=absgrad,
         )

@@ -60,7 +60,7 @@ class GsplatLists:
     width: int  # of the image, pixels
     height: int
     starts: Tensor  # start of each tile's list, int32 [1, rows, columns]
-    primitives: Tensor  # indices of Gaussians, int32 [L]
+    gaussians: Tensor  # indices of Gaussians, int32 [L]
     drawn: Tensor | None = None  # tiles of the image, bool [1, rows, columns]; None if all are
 
 
@@ -86,15 +86,15 @@ def tile_lists(splats: Splats, width: int, height: int, *, capacity: Capacity) -
     capacity.needed.append(ends[-1].clone())  # a view would keep the sums of all Gaussians
     pairs, below = (int(ends[-1]), 0) if capacity.pairs is None else (capacity.pairs, 1)
     tiles = torch.full((pairs,), columns * rows, dtype=dtype, device=device)
-    primitives = torch.zeros(pairs, dtype=torch.int32, device=device)
-    kernels["list_tiles"](n * lanes, [*geometry, counts, ends, pairs, tiles, primitives])
+    gaussians = torch.zeros(pairs, dtype=torch.int32, device=device)
+    kernels["list_tiles"](n * lanes, [*geometry, counts, ends, pairs, tiles, gaussians])
     tiles, by_tile = torch.sort(tiles, stable=True)  # stable, so each list stays in order of depth
     numbers = torch.arange(columns * (rows + below), dtype=dtype, device=device)
     starts = torch.searchsorted(tiles, numbers, out_int32=True)
     shape = (1, rows + below, columns)
     # Gradients would walk through the unused pairs, so their tiles are marked.
     drawn = (numbers < columns * rows).view(shape) if below else None
-    return GsplatLists(width, height, starts.view(shape), primitives.index_select(0, by_tile), drawn)
+    return GsplatLists(width, height, starts.view(shape), gaussians.index_select(0, by_tile), drawn)
 
 
 def listing_options(dtype: torch.dtype) -> tuple[str, ...]:
@@ -124,14 +124,14 @@ class _Blend(torch.autograd.Function):
         splats = [value.contiguous() for value in (means2d, conics, colors, opacities)]
         image = colors.new_empty(1, height, width, colors.shape[-1])
         alphas = colors.new_empty(1, height, width, 1)
-        lefts = torch.empty_like(alphas)  # transmittance: 1 - alpha would round it to multiples of 6e-8
+        transmittances = torch.empty_like(alphas)  # 1 - alpha would round them to multiples of 6e-8
         stops = torch.empty(height, width, dtype=torch.int32, device=colors.device)
         tiles = -(-width // TILE) * -(-height // TILE)
-        ctx.lists = [width, height, tiles, lists.starts.numel(), len(lists.primitives), lists.starts, lists.primitives]
+        ctx.lists = [width, height, tiles, lists.starts.numel(), len(lists.gaussians), lists.starts, lists.gaussians]
         options = blending_options(colors.shape[-1], absgrad=absgrad)
         ctx.kernels = load_kernels("blending.cu", ("blend", "blend_backward"), options, colors.device, _PIXELS)
-        ctx.kernels["blend"](tiles * _PIXELS, [*ctx.lists, *splats, image, alphas, lefts, stops])
-        ctx.save_for_backward(means2d, *splats, lefts, stops)
+        ctx.kernels["blend"](tiles * _PIXELS, [*ctx.lists, *splats, image, alphas, transmittances, stops])
+        ctx.save_for_backward(means2d, *splats, transmittances, stops)
         ctx.absgrad = absgrad
         return image, alphas
 

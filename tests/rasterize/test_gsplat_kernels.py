@@ -93,9 +93,9 @@ def most_alpha(primitives, column, row, width, height):
 def by_tile(primitives, width, height, capacity=None):
     splats = Splats(**{name: value[None] for name, value in primitives.items()})
     lists = tile_lists(splats, width, height, capacity=capacity or Capacity())
-    ends = [*lists.starts.flatten()[1:].tolist(), len(lists.primitives)]
+    ends = [*lists.starts.flatten()[1:].tolist(), len(lists.gaussians)]
     starts = lists.starts.flatten().tolist()
-    return [lists.primitives[start:end].long() for start, end in zip(starts, ends, strict=True)]
+    return [lists.gaussians[start:end].long() for start, end in zip(starts, ends, strict=True)]
 
 
 @pytest.mark.parametrize(("width", "height"), [(150, 100), (1, 1), (400, 37), (20, 700)])
