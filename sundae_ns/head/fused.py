@@ -17,6 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from sundae_ns.core.values import usual_defaults
 from sundae_ns.cuda.kernels import Argument, Launch, load_kernels
 from sundae_ns.head.unet import SLOPE, UNet
 
@@ -140,6 +141,7 @@ def fold_pixels(
     return folded
 
 
+@usual_defaults()  # autocast would convolve in a dtype that the kernels do not read
 def network(net: UNet, weights: list[Tensor], folded: Tensor, launches: Launches) -> Tape:
     """Run the network from its folded input ``[1, C, h, w]``, channels last, to the input of the last kernel."""
     levels = len(net.encoder)
@@ -280,6 +282,7 @@ def network_backward(
     return gradient, [tensor for number in range(len(gradients)) for tensor in gradients[number]]
 
 
+@usual_defaults()
 def unfold_backward(
     net: UNet, raw: Tensor, gradient: Tensor, alpha: Tensor, launches: Launches
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -218,9 +218,8 @@ def resize(image: Tensor, height: int, width: int) -> Tensor:
 
 def bytes_of_module(module: nn.Module | None) -> int:
     """Bytes of a module's parameters and buffers, each in its own dtype; a shared tensor counts once; 0 for None."""
-    if module is None:
-        return 0
-    return sum(tensor.numel() * tensor.element_size() for tensor in [*module.parameters(), *module.buffers()])
+    tensors = [] if module is None else [*module.parameters(), *module.buffers()]
+    return sum(tensor.numel() * tensor.element_size() for tensor in tensors)
 
 
 def stored_bytes(params: Mapping[str, Tensor], head: HeadConfig | None) -> int:
