@@ -204,8 +204,8 @@ def _even(keys: Array, up: Array, count: int) -> Array:
     knots = []
     for here, there in zip(keys, np.roll(keys, -1, axis=0), strict=True):
         knots.append(here)
-        if here[3:] @ there[3:] < -0.5:  # between opposite directions a spline would flip: look to the side
-            side = np.cross(up, here[3:] - there[3:])
+        side = np.cross(up, here[3:] - there[3:])  # 0 from one pitch to another
+        if here[3:] @ there[3:] < -0.5 and np.linalg.norm(side) > 0.2:  # a spline would flip: look to the side
             knots.append(np.hstack([(here[:3] + there[:3]) / 2, side / np.linalg.norm(side)]))
     ends = np.array([*knots, knots[0]])
     # Parameters of square roots of distances keep the spline from swinging out (centripetal).
