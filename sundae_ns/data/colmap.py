@@ -112,7 +112,7 @@ def read_points(model: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
             return points["xyz"].copy(), points["rgb"].copy()
     if (model / "points3D.txt").exists():
         with _content(model / "points3D.txt") as content:
-            rows = _rows(content)
+            rows = _rows(content, splits=7)  # the rest of a line is its track
             positions = np.array([[float(word) for word in row[1:4]] for row in rows], dtype=np.float64)
             colours = b"".join(bytes(int(word) for word in row[4:7]) for row in rows)
             return positions.reshape(len(rows), 3), np.frombuffer(colours, np.uint8).reshape(len(rows), 3).copy()
@@ -152,7 +152,7 @@ def _cameras(content: bytes, text: bool) -> Iterator[tuple[int, str | int, int, 
 
 def _images(content: bytes, text: bool) -> Iterator[tuple[int, tuple[float, ...], int, str]]:
     if text:
-        for number, *words, camera, name in _rows(content, images=True):
+        for number, *words, camera, name in _rows(content, images=True, splits=9):
             if len(words) != 7:
                 raise ValueError(f"image {number} has {len(words)} numbers as its pose")
             yield int(number), tuple(map(float, words)), int(camera), name.replace("\\", "/")
@@ -168,13 +168,13 @@ def _images(content: bytes, text: bool) -> Iterator[tuple[int, tuple[float, ...]
         raise ValueError(f"its entries take {at:,} bytes, it has {len(content):,}")
 
 
-def _rows(content: bytes, *, images: bool = False) -> list[list[str]]:
-    """Words of the entries of a text. An image has a second line, and a name that may have spaces."""
+def _rows(content: bytes, *, images: bool = False, splits: int = -1) -> list[list[str]]:
+    """Words of the entries of a text, after some splits the rest of the line. An image has a second line."""
     lines = map(str.strip, re.split(r"\r\n|\r|\n", content.decode("utf-8-sig")))
     rows = []
     for line in lines:
         if line and not line.startswith("#"):
-            rows.append(line.split(maxsplit=9 if images else -1))
+            rows.append(line.split(maxsplit=splits))
             if images and not re.fullmatch(r"(?:.*\s)?-?[\d.]+|#.*|", next(lines, "")):
                 raise ValueError(f"after image {line.split()[0]} stands no line of observations, which may be empty")
     # A text cut between two lines has no other sign.
