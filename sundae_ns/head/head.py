@@ -143,7 +143,7 @@ class CompensationHead(nn.Module):
         self._weights = tuple(self.net.parameters())
 
     def forward(self, base: Tensor, splatted: Tensor, alpha: Tensor) -> Tensor:
-        """Compensate one image; returns ``[H, W, 3]`` float32, not clamped.
+        """Compensate one image; returns ``[H, W, 3]``, not clamped. All images are float32, on the head's device.
 
         ``base`` is the spherical-harmonics image over its background, in [0, 1] ``[H, W, 3]``. ``splatted`` ``[H, W, 3
         + F]`` are the same colours without background, so that the head does not depend on it, and the features. Where

@@ -32,7 +32,7 @@ _ROUNDING = "-DROUNDING=1e-5f"  # slack on exponents, relative to their terms: r
 
 
 class Splats(NamedTuple):
-    """Gaussians on the screen of one image, as gsplat projects them; float32, contiguous. Of V views ``[V, N]``."""
+    """Gaussians on the screen of one image, as gsplat projects them; float32. Of V views ``[V, N]``."""
 
     radii: Tensor  # int32 [1, N]; one per axis [1, N, 2] from gsplat 1.5 on; 0 where a Gaussian is culled
     means2d: Tensor  # centres in pixels [1, N, 2]
@@ -71,7 +71,7 @@ def tile_lists(splats: Splats, width: int, height: int, *, capacity: Capacity) -
     The number of pairs needed is appended to ``capacity``. Without a limit this waits once for the device. With a
     limit, an extra row of tiles below the image takes the unused pairs. ``BackendError`` without the kernels.
     """
-    radii, means2d, depths, conics, opacities = splats
+    radii, means2d, depths, conics, opacities = (value.contiguous() for value in splats)
     device = means2d.device
     columns, rows = -(-width // TILE), -(-height // TILE)
     dtype = torch.int16 if columns * (rows + 1) <= torch.iinfo(torch.int16).max else torch.int32

@@ -156,7 +156,8 @@ def test_nan_is_left_to_gsplat():
 
 def test_radii_per_axis():
     primitives = gaussians(200, 150, 100)
-    per_axis = {**primitives, "radii": primitives["radii"][:, None].repeat(1, 2)}
+    per_axis = {name: torch.stack(3 * [value], dim=1)[:, 0] for name, value in primitives.items()}  # not contiguous
+    per_axis["radii"] = primitives["radii"][:, None].repeat(1, 3)[:, :2]
     one, other = (by_tile(rows, 150, 100) for rows in (per_axis, primitives))
     assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
     per_axis["radii"][:, 1] = per_axis["radii"][:, 1] // 3
