@@ -27,7 +27,7 @@ def _distances(points: Tensor, others: Tensor, nth: int = 1) -> Tensor:
     if len(others) < nth or not len(points):
         return points.new_full((len(points),), torch.inf)
     # From one of them, because cdist squares coordinates, whose digits a scene far from the origin would take.
-    points, others = points - others[0], others - others[0]
+    points, others = (each - others[0].nan_to_num() for each in (points, others))
     nearest = (torch.cdist(rows, others).topk(nth, largest=False).values for rows in points.split(1 << 14))
     return torch.cat([distances[:, -1] for distances in nearest])
 
