@@ -8,22 +8,19 @@ from torch import Tensor
 from sundae_ns.core.errors import BackendError
 from sundae_ns.rasterize import gsplat_kernels
 from sundae_ns.rasterize.gsplat_kernels import TILE, Capacity, GsplatLists, Splats
-from sundae_ns.rasterize.reference import ReferenceBackend
 from sundae_ns.rasterize.types import Inputs, Rasterization, constant, is_gsplat_1_5, result_of
 
 _CHANNELS_PER_PASS = 32
 
 
 class GsplatBackend:
-    """gsplat's kernels, for float32 tensors on a CUDA device; every method raises ``BackendError`` for others."""
+    """gsplat's kernels, for one Gaussian at least, float32 on a CUDA device; ``BackendError`` for other tensors."""
 
     name = "gsplat"
 
     def rasterize(self, inputs: Inputs) -> Rasterization:
         """Render one view."""
         check_kernels_take(inputs.means)
-        if inputs.means.shape[0] == 0:  # CUDA refuses to launch a grid of no blocks
-            return ReferenceBackend().rasterize(inputs)
         camera = inputs.camera
         images, alphas, splats = self._draw(inputs, camera.viewmat[None], camera.K[None], inputs.colors[None])
         return result_of(images[0], alphas[0], splats.means2d, splats.radii, inputs)
@@ -68,8 +65,6 @@ class GsplatBackend:
         from gsplat import spherical_harmonics
 
         check_kernels_take(directions)
-        if directions.shape[0] == 0:
-            return ReferenceBackend().spherical_harmonics(degree, directions, first, rest)
         return spherical_harmonics(degree, directions, torch.cat([first[:, None], rest], dim=1))
 
 

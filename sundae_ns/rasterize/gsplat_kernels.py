@@ -182,12 +182,15 @@ class _Colors(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         means, center, dc, rest, colors = ctx.saved_tensors
-        wanted = (means, dc, rest if ctx.needs_input_grad[4] else None)
-        grads = [None if value is None else torch.empty_like(value) for value in wanted]
+        grad_means, grad_dc = torch.empty_like(means), torch.empty_like(dc)
+        grad_rest = torch.empty_like(rest) if ctx.needs_input_grad[4] else None
         threads = -(-len(means) // _PER_BLOCK) * _PER_BLOCK
         given = [len(means), ctx.degree, means, center, int(center.ndim > 1), rest, rest.shape[1], colors]
-        ctx.kernels["harmonic_colors_backward"](threads, [*given, gradient.contiguous(), *grads])
-        return None, grads[0], None, grads[1], grads[2]
+        given += [gradient.contiguous(), grad_means, grad_dc, grad_rest]
+        ctx.kernels["harmonic_colors_backward"](threads, given)
+        # Only differences of places count.
+        grad_center = -grad_means.sum_to_size(center.shape) if ctx.needs_input_grad[2] else None
+        return None, grad_means, grad_center, grad_dc, grad_rest
 
 
 harmonic_colors = _Colors.apply

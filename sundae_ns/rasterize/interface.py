@@ -28,7 +28,7 @@ T = TypeVar("T")
 def rasterize(inputs: Inputs, *, backend: Backend) -> Rasterization:
     """Splat N Gaussians into one pinhole camera (EWA splatting, front-to-back blending; Kerbl et al. 2023).
 
-    Differentiable with respect to the Gaussians, and to ``camera.viewmat`` except under gsplat; not to ``camera.K``.
+    Differentiable with respect to the Gaussians and to ``camera.viewmat``; under gsplat not to ``camera.K``.
     ``DataError`` for a tensor of a wrong shape, dtype or device, and for an empty image; ``MemoryExhaustedError`` if,
     on a CPU, the image or its lists need more memory than there is, or without gradients it has more Gaussians than any
     real one.
@@ -39,7 +39,7 @@ def rasterize(inputs: Inputs, *, backend: Backend) -> Rasterization:
         # Beside the blended channels: accumulation, state of the pixels, depth, and a base image with its parts.
         size = (inputs.colors.shape[1] + 15) * width * height * inputs.means.element_size()
         check_memory(size, f"images of {width:,} x {height:,} pixels")
-    return backend.rasterize(inputs)
+    return (backend if len(inputs.means) else ReferenceBackend()).rasterize(inputs)  # CUDA has no grids of no blocks
 
 
 def rasterize_cameras(inputs: Inputs, viewmats: Tensor, Ks: Tensor, *, backend: Backend) -> Tensor:
@@ -92,7 +92,8 @@ def harmonic_colors(
     if len(rest) != 3 or rest[0] != n or rest[1] < needed or rest[2] != 3:
         raise DataError(f"features_rest has shape {list(rest)}; degree {degree} needs [{n}, {needed} or more, 3]")
     _check_alike("means", means, center=center, features_dc=features_dc, features_rest=features_rest)
-    if isinstance(backend, RecordableGsplat) and n:
+    backend = backend if n else ReferenceBackend()
+    if isinstance(backend, RecordableGsplat):
         check_kernels_take(means)
         return cast("Tensor", gsplat_kernels.harmonic_colors(degree, means, center, features_dc, features_rest))
     directions = means - center
