@@ -47,7 +47,7 @@ class Crop(NamedTuple):
 
 
 class Camera(NamedTuple):
-    """One camera in the rasteriser's form."""
+    """A pinhole camera without distortion: pose, intrinsics and image size."""
 
     viewmat: Tensor  # World-to-camera, OpenCV axes ``[4, 4]``
     K: Tensor  # Intrinsics in pixels ``[3, 3]``

@@ -110,7 +110,7 @@ class Lpips:
 
 @dataclass(frozen=True)
 class Quality:
-    """Quality of images, a value for each camera."""
+    """PSNR and SSIM of images: a value for each camera, and their means."""
 
     psnrs: tuple[float, ...]
     """Peak signal-to-noise ratio over all pixels and channels, dB."""

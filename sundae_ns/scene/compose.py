@@ -91,7 +91,7 @@ def transform(
 
 
 def merge(scenes: Iterable[Scene]) -> Scene:
-    """Several scenes, at least one, as one, in their order: Gaussians and stored cameras.
+    """Join scenes, at least one, in their order: Gaussians and stored cameras.
 
     All else is that of the first scene: device, background, start view, coordinates. Those of others are not changed
     (:func:`transform` does it), except for survey coordinates, which fit. Missing SH degrees are zero. A head stays if
@@ -142,7 +142,7 @@ def _same(head: CompensationHead | None, other: CompensationHead | None) -> bool
 
 
 def crop(scene: Scene, low: AnyArray, high: AnyArray) -> Scene:
-    """The Gaussians with centres in a box, its faces included; all else stays.
+    """Keep the Gaussians with centres in a box, its faces included. Head and cameras stay.
 
     Args:
         scene: to cut; it does not change.
@@ -163,7 +163,7 @@ def crop(scene: Scene, low: AnyArray, high: AnyArray) -> Scene:
 def remove_floaters(
     scene: Scene, strength: float = STRENGTH, *, cameras: Camera | Iterable[Camera] | None = None
 ) -> Scene:
-    """The scene without what floats or is not seen.
+    """Remove floating and unseen Gaussians.
 
     Args:
         scene: to clean; it does not change.

@@ -163,7 +163,7 @@ class Embedded:
 def show(scene: Scene, *, height: int = 480, title: str = "Scene") -> Embedded:
     """The page of a scene, head included, as a notebook's output.
 
-    The page, which the notebook stores, contains the scene, packed by default settings; of over 10 MB it warns.
+    The page, which the notebook stores, contains the scene, packed by default settings; it warns above 10 MB.
 
     Args:
         scene: any device.
