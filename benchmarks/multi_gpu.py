@@ -1,10 +1,11 @@
-"""Train a field, tiled, on one, two and four GPUs: images a second, quality, memory of each GPU; prints a CSV.
+"""Train a field, tiled, on one, two and four GPUs: images a second, quality, memory of a GPU; print a CSV.
 
     python benchmarks/multi_gpu.py --data DIR --gpus 1 2 --field warm.ckpt --primitives 10000000
     python benchmarks/multi_gpu.py --data DIR --gpus 1 2 --field some.ply --primitives 2000 --steps 12 --cpu
 
 Runs train ``--steps`` images on copies of the field side by side, without growing or pruning. Each run starts fresh
 processes. Words that this script does not know are options of ``ns-train``. The second line tries it on a CPU.
+The table belongs in results/multi_gpu.csv.
 """
 
 from __future__ import annotations

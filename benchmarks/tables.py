@@ -204,12 +204,11 @@ def multi_gpu() -> list[str]:
     """Training on one and several GPUs."""
     heads = ["field", "GPUs", "Gaussians", "images a second", "PSNR, dB", "MiB of a GPU, at most"]
     rows, above = [], ""
-    for line in sorted(lines_of("multi_gpu.jsonl"), key=lambda line: (line["variant"], line["ranks"])):
-        field = f"{line['scene']}, tiled"
-        psnr = list(line["psnr_after_images"].values())[-1]
-        cells = [f"{line['ranks']} {gpu(line['gpu'].rpartition(' x ')[2])}"]
-        figures = ((line["primitives"], 0), (line["images_per_s"], 1), (psnr, 2), (max(line["peak_mib"]), 0))
-        rows.append([field if field != above else "", *cells, *(number(*figure) for figure in figures)])
+    digits = {"primitives": 0, "images_per_s": 1, "psnr": 2, "peak_mib": 0}
+    for line in lines_of("multi_gpu.csv"):
+        field = line["field"].partition(" to ")[0]
+        figures = (number(float(line[name]), count) for name, count in digits.items())
+        rows.append([field if field != above else "", f"{line['gpus']} {gpu(line['device'])}", *figures])
         above = field
     return table(heads, rows)
 

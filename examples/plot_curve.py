@@ -23,7 +23,7 @@ SHARES = (0.05, 0.1, 0.2, 0.4, 0.7)
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", type=Path, help=".ply, .spz, .sog, .sundae, or a run of ns-train")
+    parser.add_argument("scene", type=Path, help="a file of Gaussians of any program, or a run of ns-train")
     parser.add_argument("out", type=Path, help="image to write")
     parser.add_argument("--cameras", type=int, default=64, help="number of virtual cameras")
     options = parser.parse_args()
@@ -38,7 +38,7 @@ def main() -> None:
         for each, quality in zip(small, found, strict=True):
             print(f"{name}: {each.num_gaussians:,} Gaussians, {quality.psnr:.2f} dB, SSIM {quality.ssim:.4f}")
         axes.plot([each.num_gaussians for each in small], [quality.psnr for quality in found], "o-", label=name)
-    axes.set(xscale="log", xlabel="primitives", ylabel="PSNR against the whole scene, dB")
+    axes.set(xscale="log", xlabel="Gaussians", ylabel="PSNR against the whole scene, dB")
     axes.legend()
     axes.grid(alpha=0.3)
     figure.savefig(options.out, dpi=150)

@@ -2,7 +2,7 @@
 
     python examples/prune_ply.py garden.ply small.ply --keep 0.25
 
-The output is .ply, .spz, .sog or .sundae, by its suffix.
+The output is .ply, .spz, .sog, .glb, .sundae or .html, by its suffix.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import sundae_ns as sn
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", type=Path, help=".ply, .spz, .sog, .sundae, or a run of ns-train")
+    parser.add_argument("scene", type=Path, help="a file of Gaussians of any program, or a run of ns-train")
     parser.add_argument("out", type=Path, help="file to write")
     parser.add_argument("--keep", type=float, default=0.25, help="share of the Gaussians to keep")
     parser.add_argument("--cameras", type=int, default=128, help="number of virtual cameras")

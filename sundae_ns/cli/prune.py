@@ -51,7 +51,7 @@ def prune(
     """Prune a scene of any program, without its photos; by default to a tenth of its Gaussians.
 
     Kept are the Gaussians that virtual cameras see most of; the others are merged into them, and some steps fit pairs
-    to the scene's own images. On a CPU half a million Gaussians with three bands of harmonics take about 2.2 GB.
+    to the scene's own images. On a CPU half a million Gaussians of SH degree 3 take about 2.2 GB.
 
     Args:
         out: result, by its suffix .ply, .spz, .sog, .glb, .sundae or .html; a .ply of a binary one keeps all columns.

@@ -156,7 +156,7 @@ class FrameReplay:
         """``rgb, base_rgb, accumulation`` of a view, each ``[H, W, C]``, as :func:`.render_view` makes them.
 
         Replays a recorded frame where possible: on CUDA by gsplat, without gradients, of all Gaussians in this process,
-        from the second of a size on. Other frames are the same up to the order of sums.
+        from the third in a row of a size on. Other frames are the same up to the order of sums.
         """
         if self._can_record and _recordable(source, settings):
             with self._lock:
