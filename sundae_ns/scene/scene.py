@@ -424,6 +424,6 @@ def _image(image: Any, name: str) -> Tensor:
     """An image of a caller, in [0, 1] ``[H, W, 3]``."""
     image = upright(photo_of(Path(image)))[0] if isinstance(image, (str, Path)) else image
     if isinstance(image, Image.Image):
-        converted = image if image.mode == "RGBA" else to_srgb(image).convert("RGB")
-        image = np.asarray(turned(converted, orientation_in(image)))
+        converted = to_srgb(image)
+        image = np.asarray(turned(converted.convert(converted.mode.replace("L", "RGB")), orientation_in(image)))
     return floats(image.rgb if isinstance(image, Rendering) else image, name, colors=True)

@@ -166,6 +166,7 @@ REFUSED = {
     "images to 255": (lambda: sn.measure(SCENE, [255.0 * POINTS], [CAMERA]), "image 0 has values from"),
     "CHW": (lambda: sn.measure(SCENE, [image().transpose(2, 0, 1)], [CAMERA]), r"\[20, 24, 3\] and \[3, 20, 24\]"),
     "a PIL image of floats": (lambda: sn.measure(SCENE, Image.new("F", (24, 20)), CAMERA), "pixels of type F; convert"),
+    "grey with alpha": (lambda: sn.measure(SCENE, Image.new("LA", (24, 20)), CAMERA), r"and \[20, 24, 4\]"),
     "NUL": (lambda: sn.load("a\0.ply"), "cannot be read|not a complete .ply"),
     "no image": (lambda: sn.measure(SCENE, 5, [CAMERA]), "image 0 has values from 5 to 5"),
     "gone": (lambda: sn.measure(SCENE, ["gone.png"], [CAMERA]), "gone.png"),
