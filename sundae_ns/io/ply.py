@@ -402,12 +402,12 @@ def _decompressed(chunks: NDArray[Any], vertices: NDArray[Any], harmonics: NDArr
         raise ValueError(f"{rest.shape[1]} coefficients fit no SH degree")
     if rest.dtype != np.uint8 or any(vertices[name].dtype.kind not in "iu" for name in _PACKED):
         raise ValueError("its words or its coefficients are of another type, whose numbers have no meaning here")
-    levels = np.where(rest == 0, 0, np.where(rest == 255, 1, (rest + np.float32(0.5)) / 256))
+    levels = np.array([0, *((np.arange(1, 255) + 0.5) / 256), 1], np.float32)  # of the bytes
     values: dict[str, NDArray[Any]] = {
         "means": between(_ratios(vertices["packed_position"], (11, 10, 11)), "", "xyz"),
         "scales": between(_ratios(vertices["packed_scale"], (11, 10, 11)), "scale_", "xyz"),
         "quats": from_smallest_three(rotation, vertices["packed_rotation"].astype(np.uint32) >> np.uint32(30)),
-        "features_rest": (8 * (levels - 0.5)).reshape(n, 3, rest.shape[1] // 3).transpose(0, 2, 1),
+        "features_rest": (8 * (levels - 0.5))[rest.reshape(n, 3, rest.shape[1] // 3).transpose(0, 2, 1)],
     }
     gaussians = {name: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for name, value in values.items()}
     gaussians["features_dc"] = rgb_to_sh(torch.from_numpy(np.ascontiguousarray(rgb)))
