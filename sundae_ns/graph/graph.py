@@ -36,29 +36,24 @@ class NeighborGraph:
         return self.dw == 0
 
 
-def build_graph(
-    points: Tensor, *, num_neighbors: int = 16, tau: float | None = None, sigma: float | None = None
-) -> NeighborGraph:
+def build_graph(points: Tensor, *, num_neighbors: int = 16) -> NeighborGraph:
     """Nearest-neighbour graph with Gaussian weights ``exp(-d^2 / (2 sigma^2))`` where ``d^2 < tau`` (paper, ``W_ij``).
 
-    By default ``sigma`` is the median of the positive distances to neighbours, or 1 without any, and ``tau = (3
-    sigma)^2``. The median scales with the scene. Clones (distance 0, left out) and far floaters do not move it. Half of
-    all neighbours lie within one sigma, so weights spread over (0, 1); only Gaussians beyond three times the typical
-    spacing have no edge. The paper's rule (``tau`` ten times the smallest distance, ``sigma`` the variance of
-    distances) mixes units, and leaves the graph empty if the field has a pair of clones. ``points`` ``[N, 3]`` have any
-    floating dtype and device, which the graph gets; ``sigma`` is in scene units, ``tau`` in squared ones.
-    ``num_neighbors``, the most edges of a node, are at least 1, else a ``ConfigError``. ``DataError`` for as few
-    points, or for some that are not finite.
+    ``sigma`` is the median of the positive distances to neighbours, or 1 without any, and ``tau = (3 sigma)^2``. The
+    median scales with the scene. Clones (distance 0, left out) and far floaters do not move it. Half of all neighbours
+    lie within one sigma, so weights spread over (0, 1); only Gaussians beyond three times the typical spacing have no
+    edge. The paper's rule (``tau`` ten times the smallest distance, ``sigma`` the variance of distances) mixes units,
+    and leaves the graph empty if the field has a pair of clones. ``points`` ``[N, 3]`` have any floating dtype and
+    device, which the graph gets. ``num_neighbors``, the most edges of a node, are at least 1, else a ``ConfigError``.
+    ``DataError`` for as few points, or for some that are not finite.
     """
     indices, distances = knn(points, num_neighbors)
-    sigma = _typical_distance(distances) if sigma is None else sigma
+    sigma = _typical_distance(distances)
     reach = CUTOFF * sigma
-    # A product, not a power: in Python a power that overflows raises, and a product becomes infinite.
-    tau = reach * reach if tau is None else tau
-    beyond = distances >= tau**0.5
+    beyond = distances >= reach
     # Divide before squaring: the square of a small distance could underflow. In place: these are gigabytes.
     weights = distances.div_(sigma).square_().mul_(-0.5).exp_().masked_fill_(beyond, 0)
-    return NeighborGraph(indices, weights, weights.sum(dim=1), float(tau), float(sigma))
+    return NeighborGraph(indices, weights, weights.sum(dim=1), reach * reach, sigma)
 
 
 def _typical_distance(distances: Tensor) -> float:

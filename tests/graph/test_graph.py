@@ -21,8 +21,8 @@ def edges(graph):
     return int((graph.weights > 0).sum())
 
 
-def magnitude(points, k=8, **options):
-    return response_magnitude(high_pass(build_graph(points, num_neighbors=k, **options), points))
+def magnitude(points):
+    return response_magnitude(high_pass(build_graph(points, num_neighbors=8), points))
 
 
 def check(graph, signal):
@@ -37,14 +37,13 @@ def check(graph, signal):
 
 
 def test_weights_follow_the_equation_of_the_paper():
-    points = normal(40)
-    graph = build_graph(points, num_neighbors=39, tau=1.5, sigma=0.6)
+    points = normal(40) ** 3  # a few lie beyond the reach of others
+    graph = build_graph(points, num_neighbors=39)
     squared = (points[:, None] - points[None]).square().sum(-1)
-    expected = torch.where(squared < 1.5, torch.exp(-squared / (2 * 0.6**2)), 0.0).fill_diagonal_(0)
+    expected = torch.where(squared < graph.tau, torch.exp(-squared / (2 * graph.sigma**2)), 0.0).fill_diagonal_(0)
     torch.testing.assert_close(dense(graph), expected)
     torch.testing.assert_close(graph.dw, expected.sum(1))
-    assert edges(graph) == int((expected > 0).sum())
-    assert (graph.tau, graph.sigma) == (1.5, 0.6)
+    assert 40 < edges(graph) == int((expected > 0).sum()) < 40 * 38
 
 
 def test_the_median_ignores_clones_and_floaters():
@@ -71,14 +70,8 @@ def test_the_width_is_the_lower_median_of_positive_distances(sampled, monkeypatc
     assert graph._typical_distance(torch.zeros(3, 2)) == graph._typical_distance(torch.zeros(0, 2)) == 1.0
 
 
-def test_a_given_width_sets_the_reach_and_may_overflow_as_distances_may():
-    for sigma, tau in ((2.0, 36.0), (1e200, math.inf)):
-        found = build_graph(normal(20), num_neighbors=4, sigma=sigma)
-        assert (found.tau, found.sigma) == (tau, sigma)
-    points = torch.cat([torch.randn(20, 3), torch.tensor([[3e38, 3e38, 3e38]])])
-    found = build_graph(points, num_neighbors=6, sigma=float("inf"))
-    assert set(found.weights.unique().tolist()) == {0.0, 1.0}
-    two = build_graph(torch.tensor([[0.0, 0, 0], [1.0, 0, 0]]), num_neighbors=1)  # the smallest graph
+def test_two_points_are_the_smallest_graph():
+    two = build_graph(torch.tensor([[0.0, 0, 0], [1.0, 0, 0]]), num_neighbors=1)
     assert two.sigma == 1.0
     torch.testing.assert_close(two.weights, torch.full((2, 1), math.exp(-0.5)))
 
@@ -108,16 +101,11 @@ def test_every_hard_cloud(cloud, dtype):
     st.lists(st.tuples(st.integers(-2, 2), st.integers(-2, 2), st.integers(0, 1)), min_size=2, max_size=60),
     st.integers(-30, 15),
     st.sampled_from([0.0, 1.0, 1e5]),
-    st.sampled_from([None, 0.0, 1e-30, 1.0, float("inf")]),
     st.booleans(),
 )
-def test_any_cells_at_any_scale(cells, exponent, shift, tau, double):
+def test_any_cells_at_any_scale(cells, exponent, shift, double):
     points = torch.tensor(cells, dtype=torch.float64 if double else torch.float32) * 2.0**exponent + shift
-    graph = build_graph(points, num_neighbors=min(4, len(cells) - 1), tau=tau)
-    check(graph, points)
-    assert tau in (None, graph.tau)
-    assert tau != 0 or not graph.weights.any()
-    assert tau != float("inf") or not graph.isolated.any()
+    check(build_graph(points, num_neighbors=min(4, len(cells) - 1)), points)
 
 
 @pytest.mark.gpu
