@@ -41,7 +41,7 @@ from torch import Tensor
 from sundae_ns.core.covariance import chunks
 from sundae_ns.core.errors import DataError, reading, regular
 from sundae_ns.core.files import replacing
-from sundae_ns.core.gaussians import SPLAT_NAMES, odd_shapes, rgb_to_sh, sh_degree_of, sh_to_rgb
+from sundae_ns.core.gaussians import SPLAT_NAMES, finite_mask, odd_shapes, rgb_to_sh, sh_degree_of, sh_to_rgb
 from sundae_ns.io.coordinates import Direction, recentred
 
 MODEL_FRAME = "Coordinates: nerfstudio model"  # comment of files in the coordinates of nerfstudio's model
@@ -113,7 +113,7 @@ def checked(path: Path, params: Mapping[str, Tensor]) -> dict[str, Tensor]:
     gaussians = {name: params[name].detach().to("cpu", torch.float32).contiguous() for name in SPLAT_NAMES}
     if not len(gaussians["means"]):
         raise DataError(f"the scene has no Gaussians, which a {path.suffix} cannot store; check the run")
-    if not all(bool(value.isfinite().all()) for value in (*gaussians.values(), gaussians["scales"].exp())):
+    if not bool(finite_mask({**gaussians, "widths": gaussians["scales"].exp()}).all()):
         raise DataError("some values are NaN or infinite, or widths beyond float32; remove those Gaussians first")
     if gaussians["features_rest"].shape[1] > (STORED_SH_DEGREE + 1) ** 2 - 1:
         raise DataError(f"{path.suffix} stores SH degrees up to {STORED_SH_DEGREE}; cut features_rest, or write a .ply")
