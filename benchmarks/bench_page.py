@@ -6,7 +6,7 @@
 It needs a Chromium, which renders in software here. The cameras and the sizes that the head was trained at are scaled
 together, so both renderers run the head at the size of the image. The page's images are bytes: rounding alone gives
 58.9 dB. With ``--half`` the page's renderer also runs under Node in half precision, on an adapter that has it (``make
-browser`` installs what it needs). Lines belong in results/page.jsonl, and ``make browser`` checks them.
+browser`` installs what it needs). Lines belong in results/page.jsonl; ``make browser`` asserts such errors.
 """
 
 from __future__ import annotations

@@ -1,5 +1,4 @@
-"""Break the code that prunes, schedules, packs and shards, one small change at a time, and count the changes that tests
-notice.
+"""Break the code that prunes, schedules, merges and packs, a small change at a time; count the changes that tests see.
 
     python benchmarks/mutants.py                    # 200 changes, about half an hour on one core
     python benchmarks/mutants.py --sample 40        # a quick look
