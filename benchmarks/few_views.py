@@ -58,6 +58,7 @@ def cut(capture: Path, views: int, out: Path) -> None:
         seen = seen or triangulated(cameras, kept["train"], made / "images")
         seen = {k: p._replace(image_ids=EMPTY, point2D_idxs=EMPTY) for k, p in seen.items()}
         colmap.write_model(cameras, kept["train"] | kept["eval"], seen, str(made / "sparse" / "0"), ext=".bin")
+        (made / "capture.txt").write_text(str(capture), encoding="utf-8")
         made.replace(out)
     print(f"{out}: {views} training and {len(test)} test views, {len(seen):,} points")
 
@@ -125,6 +126,8 @@ def main(
     for name, (capture, count) in cuts.items():
         if not (folder / name).exists():
             cut(capture, count, folder / name)
+        elif (of := (folder / name / "capture.txt").read_text(encoding="utf-8")) != str(capture):
+            raise ConfigError(f"{folder / name} is a cut of {of}; choose another --out for {capture}")
     code = run_suite(options)
     record(options.out, table)
     return code

@@ -52,6 +52,7 @@ def _dispatch(words: Sequence[str]) -> int:
     """Run the command that the words name; its exit code."""
     name, *options = words or ["help"]
     typed[:] = words
+    options = ["".join(map(os.path.expanduser, re.split("^(-[^=]+=)", word))) for word in options]  # --out=~/a too
     if name in ("--version", "-V", "version"):
         print(f"sundae_ns {sys.modules['sundae_ns'].__version__}")
         return 0

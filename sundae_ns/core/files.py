@@ -22,6 +22,11 @@ PARTIAL = ".partial"  # suffix of files that are not complete yet
 _WINDOWS = os.name == "nt"  # renames no open file, opens no folder, and flushes only what it may write
 
 
+def at_home(path: Path | str) -> Path:
+    """A path as a user gives it; ``~`` at its beginning becomes the home folder, as in a shell."""
+    return Path(os.path.expanduser(path))
+
+
 def locked(file: IO[Any]) -> bool | None:
     """Whether this process gets the lock of an open file until it ends; None if the file system has no locks."""
     with suppress(OSError):

@@ -24,9 +24,13 @@ def check_wiring(params: Mapping[str, Tensor], optimizers: Optimizers) -> None:
     for name, value in params.items():
         if not per_gaussian(value, n):
             raise DataError(f"parameter {name!r} has shape {list(value.shape)} for {n} Gaussians: resize it")
-        groups = optimizers[name].param_groups if name in optimizers else None
-        if groups is not None and [id(held) for group in groups for held in group["params"]] != [id(value)]:
+        if name in optimizers and [id(held) for held in parameters_of(optimizers[name])] != [id(value)]:
             raise DataError(f"the optimizer of {name!r} holds another tensor: build it from params[{name!r}]")
+
+
+def parameters_of(optimizer: Optimizer) -> list[Parameter]:
+    """The parameters that an optimizer trains."""
+    return [parameter for group in optimizer.param_groups for parameter in group["params"]]
 
 
 def per_gaussian(value: Any, n: int) -> bool:
@@ -124,16 +128,16 @@ def restore(params: Params, optimizers: Optimizers, saved: Snapshot) -> None:
         replace_parameter(params, optimizers, name, value, state)
 
 
-def module_snapshot(parameters: Iterable[Tensor], optimizer: Optimizer) -> Snapshot:
-    """Copy the parameters of a network and the state of its optimizer; keys are the parameters' positions."""
-    named = {str(i): value for i, value in enumerate(parameters)}
+def module_snapshot(optimizer: Optimizer) -> Snapshot:
+    """Copy the parameters of an optimizer, such as those of a network, and its state; keys are their positions."""
+    named = {str(i): value for i, value in enumerate(parameters_of(optimizer))}
     return snapshot(named, dict.fromkeys(named, optimizer))
 
 
 @torch.no_grad()
-def restore_module(parameters: Iterable[Tensor], optimizer: Optimizer, saved: Snapshot) -> None:
+def restore_module(optimizer: Optimizer, saved: Snapshot) -> None:
     """Restore a :func:`module_snapshot` in place; keeps the parameter objects."""
-    for i, value in enumerate(parameters):
+    for i, value in enumerate(parameters_of(optimizer)):
         entries = saved[str(i)]
         value.copy_(entries["value"])
         optimizer.state.pop(value, None)

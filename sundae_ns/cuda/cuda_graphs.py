@@ -100,9 +100,6 @@ class GraphCache(Generic[_Result]):
         self._last: Hashable = None
         self._repeats = 0
 
-    def __len__(self) -> int:
-        return len(self._graphs)
-
     def get(self, key: Hashable, make: Callable[[], _Result]) -> _Result | None:
         """The graph for ``key``, recorded by ``make`` at its :data:`RECORD_AT`-th request in a row; None before."""
         self._repeats = self._repeats + 1 if key == self._last else 1

@@ -63,6 +63,7 @@ def opened(path: Path) -> Image.Image:
         image.close()
         content = path.read_bytes()  # of a file, Pillow asks for as many bytes as a chunk states
         image = Image.open(BytesIO(content))
+        image.info |= {"deep": content} if content[24] == 16 else {}  # bits a channel, of which Pillow reads 8
         if (at := content.find(b"\0\0\0\4cICP", 0, max(content.find(b"IDAT"), 0))) >= 0:
             image.info["cicp"] = content[at + 8 : at + 12]
     elif "progressive" in image.info and (scans := path.read_bytes().count(b"\xff\xda")) > 200:  # each takes its time
@@ -153,8 +154,16 @@ def _conversion(image: Image.Image) -> Callable[[Image.Image], Any] | None:
     narrow = cicp is not None and cicp[3:] == b"\0"
     if stated[0] not in _LIGHT and stated[1] not in PRIMARIES and not isinstance(stated[0], float) and not narrow:
         return None
-    levels = [round((code - 16) * 255 / 219) if narrow else code for code in range(256)] * 3
-    return lambda base: Image.fromarray(to_srgb_values(np.asarray(base.convert("RGB").point(levels)), *stated))
+
+    def convert(base: Image.Image) -> Image.Image:
+        values = np.asarray(base.convert("RGB"))
+        if "deep" in image.info:
+            cv2: Any = importlib.import_module("cv2")  # takes 0.1 s
+            flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+            values = cv2.imdecode(np.frombuffer(image.info["deep"], np.uint8), flags)[..., ::-1]
+        return Image.fromarray(to_srgb_values(values, *stated, narrow=narrow))
+
+    return convert
 
 
 @lru_cache(maxsize=16)
@@ -173,12 +182,13 @@ def _transform(profile: bytes, mode: str) -> Any:
     return transform if change > 1 and (source == mode or (mode, source) == ("L", "RGB")) else None
 
 
-def to_srgb_values(values: NDArray[Any], transfer: float, primaries: Any) -> NDArray[np.uint8]:
+def to_srgb_values(values: NDArray[Any], transfer: float, primaries: Any, *, narrow: bool = False) -> NDArray[np.uint8]:
     """sRGB ``[H, W, 3]`` of code values, by a number and a number, or by an exponent (float) and chromaticities.
 
-    Unknown primaries count as BT.2020 in a high range, else as those of sRGB.
+    ``narrow`` values reach from 16 to 235 of 256. Unknown primaries count as BT.2020 in a high range, else as sRGB's.
     """
-    codes = np.linspace(0, 1, np.iinfo(values.dtype).max + 1)
+    codes = np.linspace(0, 1, count := np.iinfo(values.dtype).max + 1)
+    codes = ((codes * (count - 1) * 256 / count - 16) / 219).clip(0, 1) if narrow else codes
     light = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
     light = codes**transfer if isinstance(transfer, float) else _LIGHT[transfer](codes) if transfer in _LIGHT else light
     light = light.astype(np.float32)[values]

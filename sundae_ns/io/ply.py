@@ -30,6 +30,7 @@ import math
 import re
 import shutil
 from collections.abc import Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -206,7 +207,7 @@ class _Ply:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.text = False  # whether rows are text
-        # For each element the bytes (in text, the lines) before its rows, the number of these, and their dtype.
+        # For each element the bytes (in text, other rows) before its rows, the number of these, and their dtype.
         self.elements: dict[str, tuple[int, int, np.dtype[Any]]] = {}
         with reading(path, "a complete .ply file"):
             self.header = _header(path)
@@ -223,7 +224,7 @@ class _Ply:
                     case ["property", kind, name]:
                         columns.append((name, "f8" if self.text and _TYPES[kind] == "f4" else order + _TYPES[kind]))
             least = 0  # bytes of all rows; a number of text has at least two with what follows it
-            start = len(self.header.splitlines()) if self.text else len(self.header)
+            start = 0 if self.text else len(self.header)
             for name, (rows, columns) in stated.items():
                 if rows < 0 or (rows > 0 and not columns):
                     raise ValueError("an element has no properties, or a negative number of rows")
@@ -251,7 +252,9 @@ class _Ply:
             if not self.text:
                 return np.memmap(self.path, kind, "c", start, count)
             with self.path.open(encoding="latin-1") as file:
-                table = np.loadtxt(file, kind, comments=None, skiprows=start, max_rows=count, ndmin=1)
+                file.seek(len(self.header))
+                lines = islice(filter(str.strip, file), start, start + count)  # some programs leave lines empty
+                table = np.loadtxt(lines, kind, comments=None, ndmin=1)
             if len(table) != count:
                 raise ValueError(f"its header states {count:,} rows, it has {len(table):,}")
             return table

@@ -57,7 +57,6 @@ def check_options(config: Any) -> None:
         ("continuous pruning to a count or under a cap", pruning.mode == "continuous" and counted),
         ("a camera optimizer", model.camera_optimizer.mode != "off"),
         ("--mixed-precision", config.mixed_precision or config.use_grad_scaler),
-        ("--gradient-accumulation-steps", config.gradient_accumulation_steps),
     ):
         if given:
             raise ConfigError(f"{name} does not work on several GPUs; leave it out, or use --machine.num-devices 1")

@@ -163,7 +163,7 @@ class SundaeModel(SplatfactoModel):
             "step": state.step,
             "num_features": self.config.num_features,
             "encoding": state.gaussians.encoding,
-            "running": state.running_states(),
+            "running": {"densification": dict(state.densification), "pruning": dict(state.pruning)},
             "extensions": {callback.name: dict(callback.state_dict()) for callback in self.train_callbacks},
             "trained_focal": state.trained_focal and list(state.trained_focal),
             "head_enabled": state.head_enabled,
@@ -366,6 +366,7 @@ class NerfstudioRun:
         self.state: TrainingState = model.state
         self.background: Tensor = model.background_color.to(model.device)
         self._optimizers, self._pipeline = attributes.optimizers, cast(Any, attributes.pipeline)
+        self._datamanager: SundaeDatamanager = cast(Any, getattr(self._pipeline, "datamanager", None))
         self._trainer = cast(Any, attributes.trainer)
         self._ranks: Ranks = getattr(self._trainer, "ranks", None) or Ranks()
         self.images_per_step = self._ranks.count  # Each image of a batch counts as a step
@@ -386,10 +387,6 @@ class NerfstudioRun:
     def settings(self) -> RenderSettings:
         """Settings of images that are not trained on, at this step."""
         return self.model.render_settings(training=False)
-
-    @property
-    def _datamanager(self) -> SundaeDatamanager:
-        return cast(SundaeDatamanager, self._pipeline.datamanager)
 
     def view_indices(self) -> list[int]:
         """Indices of the training views."""

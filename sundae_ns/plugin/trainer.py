@@ -22,9 +22,9 @@ from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 
-from sundae_ns.core.errors import NOTHING_SAVED, CheckpointError, reading, writing
-from sundae_ns.core.files import write_text
-from sundae_ns.core.values import usual_defaults
+from sundae_ns.core.errors import NOTHING_SAVED, BackendError, CheckpointError, ConfigError, reading, writing
+from sundae_ns.core.files import at_home, write_text
+from sundae_ns.core.values import usual_defaults, whole
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.io import checkpoint, run_folder
 from sundae_ns.io.config_file import find_capture
@@ -57,6 +57,12 @@ class SundaeTrainerConfig(TrainerConfig):
 
     def print_to_terminal(self) -> None:
         """Check the capture, make the schedule and log it; ``ns-train`` calls this first of all."""
+        for name, least, most in (("num_devices", 1, 1 << 16), ("num_machines", 1, 1 << 16), ("seed", 0, 2**32 - 1)):
+            whole(getattr(self.machine, name), f"--machine.{name.replace('_', '-')}", least, most)
+        if self.machine.device_type == "cuda" and not torch.cuda.is_available():
+            raise BackendError("--machine.device-type is cuda and torch sees no GPU; give cpu, or run sundae doctor")
+        if self.gradient_accumulation_steps:
+            raise ConfigError("--gradient-accumulation-steps loses gradients at prunes and at a resume; leave it out")
         if self.machine.num_devices > 1:
             distributed.forward_signals()
         self.make_paths_absolute()
@@ -74,7 +80,7 @@ class SundaeTrainerConfig(TrainerConfig):
         CONSOLE.print(table)
 
     def make_paths_absolute(self) -> None:
-        """Make the paths absolute that ``config.yml`` states, because a run may be opened from another folder."""
+        """Make the paths of ``config.yml`` absolute, because a run may be opened from another folder."""
         datamanager: Any = self.pipeline.datamanager
         owners: list[Any] = [(self, name) for name in ("data", "output_dir", "load_dir")]
         owners += [(datamanager, "data"), (self.pipeline.model, "warm_start")]
@@ -82,7 +88,7 @@ class SundaeTrainerConfig(TrainerConfig):
             owners.append((datamanager.dataparser, "data"))
         for owner, name in owners:
             if isinstance(value := getattr(owner, name, None), Path):
-                setattr(owner, name, value.absolute())
+                setattr(owner, name, at_home(value).absolute())
 
     def get_base_dir(self) -> Path:
         """Folder of the run: where a command of nerfstudio has found it, for a run that was copied or moved."""
@@ -212,7 +218,6 @@ class SundaeTrainer(Trainer):
             and all(isinstance(adam, FusedAdamConfig) and adam.max_norm is None for adam in adams)
             and model.camera_optimizer.config.mode == "off"
             and not model.config.output_depth_during_training
-            and max(self.gradient_accumulation_steps.values(), default=1) == 1
             and not self.mixed_precision
             and not config.log_gradients
         )

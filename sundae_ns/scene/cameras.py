@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from sundae_ns.core.camera import OPENGL_TO_OPENCV, Camera, poses_looking_at, world_to_camera
 from sundae_ns.core.covariance import rotation_matrices
 from sundae_ns.core.errors import ConfigError, DataError
+from sundae_ns.core.files import at_home
 from sundae_ns.data.capture import finite, matrix, read_json, rigid, side
 from sundae_ns.data.colmap import read_images
 from sundae_ns.data.layouts import is_model, models_in
@@ -55,7 +56,7 @@ def cameras_of(path: Path | str, scene: Scene | None = None) -> list[Camera]:
     >>> sn.cameras_of(path)[0].center
     tensor([0., 0., 3.])
     """
-    return read_cameras(Path(path), scene)[0]
+    return read_cameras(at_home(path), scene)[0]
 
 
 def read_cameras(path: Path, scene: Scene | None = None) -> tuple[list[Camera], float | None]:

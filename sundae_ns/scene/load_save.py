@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.core.errors import CheckpointError, ConfigError, DataError
-from sundae_ns.core.files import write_bytes
+from sundae_ns.core.files import at_home, write_bytes
 from sundae_ns.core.gaussians import FEATURES
 from sundae_ns.data.capture import read_json
 from sundae_ns.head.head import SIZES, CompensationHead, HeadConfig
@@ -49,7 +49,7 @@ def load(path: Path | str, *, device: torch.device | str = "cpu") -> Scene:
     >>> sn.load(path)
     Scene(50 Gaussians, SH degree 0, no head, cpu)
     """
-    return load_with_mask(Path(path), device)[0]
+    return load_with_mask(at_home(path), device)[0]
 
 
 def load_with_mask(path: Path, device: torch.device | str = "cpu") -> tuple[Scene, Tensor | None]:
@@ -105,7 +105,7 @@ def save(scene: Scene, path: Path | str, *, upright: bool = False, config: PackC
     >>> sn.load(path).num_gaussians
     50
     """
-    path = Path(path)
+    path = at_home(path)
     if (suffix := path.suffix.lower()) not in SUFFIXES:
         raise ConfigError(f"{path} has no supported suffix; name it {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
     if upright and suffix not in formats.FORMATS:

@@ -23,7 +23,7 @@ from PIL import Image
 
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import ConfigError, MemoryExhaustedError, PackError, reading, regular
-from sundae_ns.core.files import write_files
+from sundae_ns.core.files import at_home, write_files
 from sundae_ns.core.values import whole
 from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.scene.cameras import opening
@@ -56,7 +56,7 @@ def page(scenes: Scene | Mapping[str, Scene], path: Path | str, *, views: Mappin
     named = {Path(path).resolve().stem: scenes} if isinstance(scenes, Scene) else dict(scenes)
     if Path(path).suffix.lower() not in ("", ".html"):
         raise ConfigError(f"{path} is no page; name it .html, or a folder without a suffix")
-    write_page(Path(path), *(shown_as(name, scene) for name, scene in named.items()), views=views)
+    write_page(at_home(path), *(shown_as(name, scene) for name, scene in named.items()), views=views)
 
 
 def shown_as(name: str, scene: Scene, config: PackConfig | None = None) -> Shown:

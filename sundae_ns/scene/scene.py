@@ -16,6 +16,7 @@ from torch import Tensor
 
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import BackendError, ConfigError, DataError, one_line
+from sundae_ns.core.files import at_home
 from sundae_ns.core.gaussians import FEATURES, MAX_SH_DEGREE, Gaussians, checked, rgb_to_sh, sanitise, sh_to_rgb
 from sundae_ns.core.metrics import Quality, evaluate
 from sundae_ns.core.values import AnyArray, fitting, floats, numbers, positions, whole
@@ -422,7 +423,7 @@ def measure(
 
 def _image(image: Any, name: str) -> Tensor:
     """An image of a caller, in [0, 1] ``[H, W, 3]``."""
-    image = upright(photo_of(Path(image)))[0] if isinstance(image, (str, Path)) else image
+    image = upright(photo_of(at_home(image)))[0] if isinstance(image, (str, Path)) else image
     if isinstance(image, Image.Image):
         converted = to_srgb(image)
         image = np.asarray(turned(converted.convert(converted.mode.replace("L", "RGB")), orientation_in(image)))

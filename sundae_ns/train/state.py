@@ -125,28 +125,22 @@ class TrainingState:
         )
 
     def snapshot(self, *, head: bool) -> dict[str, Snapshot]:
-        """Copy the field, and the head if asked for, with the states of their optimizers."""
-        saved = {"field": snapshot(self.gaussians, self.optimizers)}
-        if head:
-            assert self.head is not None
-            saved["head"] = module_snapshot(self.head.parameters(), self.optimizers[HEAD])
-        return saved
+        """Copy the field and the poses of cameras, and the head if asked for, with the states of their optimizers."""
+        others = self.optimizers.keys() - self.gaussians.keys() - (set() if head else {HEAD})
+        copies = {name: module_snapshot(self.optimizers[name]) for name in others}
+        return {"field": snapshot(self.gaussians, self.optimizers), **copies}
 
     def restore(self, saved: Mapping[str, Snapshot]) -> None:
         """Restore a :meth:`snapshot`, with any number of Gaussians, and the width of its head."""
         self.restored += 1
         restore(self.gaussians, self.optimizers, saved["field"])
-        if "head" in saved:
-            assert self.head is not None
+        if HEAD in saved:
             self.widen_head(self.gaussians[FEATURES].shape[1])
-            restore_module(self.head.parameters(), self.optimizers[HEAD], saved["head"])
-
-    def running_states(self) -> dict[str, dict[str, Any]]:
-        """Running states for a checkpoint."""
-        return {"densification": dict(self.densification), "pruning": dict(self.pruning)}
+        for name in saved.keys() & self.optimizers.keys():
+            restore_module(self.optimizers[name], saved[name])
 
     def load_running_states(self, saved: Mapping[str, Mapping[str, Any]]) -> None:
-        """Counterpart of :meth:`running_states`; tensors move to the device of the field."""
+        """Load running states of a checkpoint; tensors move to the device of the field."""
         for name, running in (("densification", self.densification), ("pruning", self.pruning)):
             running.clear()
             running |= {k: v.to(self.device) if isinstance(v, Tensor) else v for k, v in saved[name].items()}

@@ -81,9 +81,10 @@ def test_the_installed_command_takes_any_name_and_no_warning_for_an_error(tmp_pa
 
 def test_a_file_of_any_name_is_written(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
     sn.save(sn.Scene.from_points(torch.rand(50, 3), torch.rand(50, 3)), tmp_path / "a.glb")
     name = os.fsdecode(b"\xff.html")
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), "utf-8", errors="backslashreplace"))
-    assert run("export", "a.glb", "-o", name) == 0
-    assert sys.stdout.buffer.getvalue().startswith(b"\\udcff.html: ")
+    assert run("export", "~/a.glb", f"--out=~/{name}") == 0
+    assert sys.stdout.buffer.getvalue().startswith(os.fsencode(tmp_path) + b"/\\udcff.html: ")
     assert Path(name).stat().st_size > 1000

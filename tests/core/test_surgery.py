@@ -153,17 +153,17 @@ def test_a_network_is_restored_in_place():
             net(torch.ones(2, 3)).square().sum().backward()
             optimizer.step()
 
-    fresh = module_snapshot(net.parameters(), optimizer)
+    fresh = module_snapshot(optimizer)
     steps(3)
-    saved, objects = module_snapshot(net.parameters(), optimizer), list(net.parameters())
+    saved, objects = module_snapshot(optimizer), list(net.parameters())
     steps(4)
     expected = [value.detach().clone() for value in net.parameters()]
     steps(2)
-    restore_module(net.parameters(), optimizer, saved)
+    restore_module(optimizer, saved)
     assert all(a is b for a, b in zip(objects, net.parameters()))
     steps(4)
     assert all(torch.equal(a, b) for a, b in zip(expected, net.parameters()))
-    restore_module(net.parameters(), optimizer, fresh)
+    restore_module(optimizer, fresh)
     assert not optimizer.state, "before the first step there are no moments"
 
 

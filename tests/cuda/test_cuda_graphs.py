@@ -36,13 +36,13 @@ def test_the_least_recently_used_graph_is_dropped():
     cache.get(0, lambda: -1)
     for _ in range(RECORD_AT):
         cache.get(MAX_GRAPHS, lambda: MAX_GRAPHS)
-    assert len(cache) == MAX_GRAPHS
+    assert len(cache._graphs) == MAX_GRAPHS
     assert cache.get(0, lambda: -1) == 0
     assert cache.get(1, lambda: -1) is None
     cache.put(0, 7)
     assert cache.get(0, lambda: -1) == 7
     cache.clear()
-    assert len(cache) == 0
+    assert len(cache._graphs) == 0
     assert cache.get(0, lambda: -1) is None  # the count of repeats starts anew
 
 

@@ -4,6 +4,7 @@ import struct
 import zlib
 from functools import partial
 
+import cv2
 import numpy as np
 import pytest
 import tifffile
@@ -86,6 +87,7 @@ def test_colours_of_heic_without_a_profile(tmp_path, transfer, primaries, change
 
 
 SAME = np.asarray(patches(), int)
+DEEP = np.round(65535 * ((SAME / 255 + 0.055) / 1.055) ** 2.4).astype(np.uint16)  # in linear light
 P3, ADOBE = (68000, 32000, 26500, 69000, 15000, 6000), (64000, 33000, 21000, 71000, 15000, 6000)
 WIDE = {"gAMA": [100000], "cHRM": [31270, 32900, *P3]}
 CODES, NARROW = SAME / 255, (SAME - 16.0).clip(0, 219) * 255 / 219
@@ -101,6 +103,7 @@ CHUNKS = {
     "gAMA and cHRM of P3": (WIDE | {"gAMA": [45455]}, "P3", 3),
     "those of sRGB": ({"gAMA": [45455], "cHRM": [31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000]}, None, 0),
     "linear": ({"gAMA": [100000]}, LINEAR, 1),
+    "linear of 16 bits": ({"gAMA": [100000]}, SAME, 0),
     "linear by cICP": ({"cICP": bytes((1, 8, 0, 1))}, LINEAR, 1),
     "PQ": ({"cICP": bytes((9, 16, 0, 1))}, HDR, 0),
     "no primaries": ({"cHRM": [0] * 8}, None, 0),
@@ -113,6 +116,7 @@ CHUNKS = {
 @pytest.mark.parametrize(("chunks", "expected", "most"), CHUNKS.values(), ids=CHUNKS)
 def test_colours_of_a_png_by_its_chunks(tmp_path, chunks, expected, most):
     patches().save(tmp_path / "a.png")
+    assert expected is not SAME or cv2.imwrite(str(tmp_path / "a.png"), DEEP[..., ::-1])
     content, head = (tmp_path / "a.png").read_bytes(), b""
     for name, data in chunks.items():
         data = data if isinstance(data, bytes) else struct.pack(f">{len(data)}I", *data)

@@ -8,7 +8,7 @@ import pytest
 from sundae_ns.core.errors import StorageError
 from sundae_ns.core.files import locked
 from sundae_ns.io.config_file import find_config
-from sundae_ns.io.run_folder import LOCK, files_of, new_name, prunes_before, prunes_of, reserve, take_records
+from sundae_ns.io.run_folder import LOCK, files_of, new_name, prunes_of, reserve, take_records
 
 
 def test_the_configuration_is_found_from_any_path_of_its_run(tmp_path):
@@ -73,20 +73,8 @@ DAMAGED = ("[", "[" * 100_000, "", "3", '"step"', "[3]", "\x00", '{"before": 9}'
 
 @pytest.mark.parametrize("text", [*DAMAGED, '[{"before": 9}]', '[{"step": "3"}]'])
 def test_damaged_records_end_no_training(tmp_path, text):
-    path = tmp_path / "prune.json"
-    path.write_text(text)
+    (tmp_path / "prune.json").write_text(text)
     assert prunes_of(tmp_path) == ([] if text in DAMAGED else json.loads(text))
     take_records(tmp_path, tmp_path / "none", 9)
     assert not (tmp_path / "none").exists()
-    assert path.read_text() == text
-    assert prunes_before(path, 7) == []
-    assert not path.exists()
-    assert (tmp_path / "prune.damaged.json").read_text() == text
-
-
-def test_records_before_a_step(tmp_path):
-    path = tmp_path / "prune.json"
-    assert (prunes_before(path, 5), prunes_of(tmp_path)) == ([], [])
-    path.write_text('[{"step": 3, "before": 9}, {"step": 7}]')
-    assert prunes_before(path, 7) == [{"step": 3, "before": 9}]
-    assert prunes_of(tmp_path) == [{"step": 3, "before": 9}, {"step": 7}]
+    assert prunes_of(tmp_path, 7) == []

@@ -67,7 +67,7 @@ def test_round_trip_into_another_count_keeps_optimizers_alive(build, training_of
         if isinstance(value, Tensor):
             assert torch.equal(target.model.state_dict()[name], value), name
     assert target.model.step == steps - 1
-    same(target.model.state.running_states(), source.model.state.running_states())
+    same(*(made.model.get_extra_state()["running"] for made in (target, source)))
     assert target.model.state.head_enabled == source.model.state.head_enabled == (steps == 5)
     target.optimizers.load_optimizers(deepcopy({k: v.state_dict() for k, v in source.optimizers.optimizers.items()}))
     assert target.live()

@@ -281,8 +281,17 @@ def test_the_schedule_is_logged_and_saved(tmp_path, monkeypatch, capsys):
     config.pipeline.datamanager.data = Path("capture")
     monkeypatch.setattr(sys, "argv", ["ns-train", "sundae", "--max-num-iterations", "3000"])
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(DataError, match="capture does not exist"):
-        config.print_to_terminal()
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    for name, value, says in (
+        ("machine.num_devices", 0, "^--machine.num-devices is 0; give a whole number, at least 1$"),
+        ("machine.seed", -1, "^--machine.seed is -1; give a whole number, at least 0$"),
+        ("machine.device_type", "cuda", "device-type is cuda and torch sees no GPU; give cpu, or run"),
+        ("gradient_accumulation_steps", {"means": 2}, "loses gradients at prunes and at a resume; leave it out$"),
+        ("max_num_iterations", 3000, "capture does not exist"),
+    ):
+        set_options(wrong := deepcopy(config), {"machine.device_type": "cpu", name: value})
+        with pytest.raises((ValueError, RuntimeError), match=says):
+            wrong.print_to_terminal()
     assert list(tmp_path.iterdir()) == []
     write_still_life(tmp_path / "capture", train_views=3, test_views=1, width=16, height=16, points=9, samples=1)
     config.pipeline.model.refine_every = 0
@@ -299,6 +308,7 @@ def test_the_schedule_is_logged_and_saved(tmp_path, monkeypatch, capsys):
     assert saved.pipeline.datamanager.data == tmp_path / "capture"
     assert saved.get_base_dir() == tmp_path / "outputs" / "e" / "sundae" / "t"
     assert (saved.pipeline.model.pruning.prune_at, saved.schedule_length) == (1200, 3000)
-    config.load_dir = Path("run that is resumed")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    config.load_dir = Path("~/run that is resumed")
     config.make_paths_absolute()
     assert config.load_dir == tmp_path / "run that is resumed", "sundae train --resume offers no run twice"

@@ -279,7 +279,6 @@ def test_a_signal_to_the_command_ends_it_or_reaches_the_ranks(still_life, tmp_pa
     [
         ({"pipeline.model.camera_optimizer.mode": "SO3xR3"}, "a camera optimizer does not work on several GPUs"),
         ({"mixed_precision": True}, "--mixed-precision"),
-        ({"gradient_accumulation_steps": {"means": 2}}, "--gradient-accumulation-steps"),
         (
             {"pipeline.model.pruning.mode": "continuous", "pipeline.model.pruning.max_gaussians": 9},
             "continuous pruning to a count",

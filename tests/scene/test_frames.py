@@ -124,7 +124,7 @@ def test_what_a_recording_has_fixed_makes_another_one(model, view, recorder):
     with torch.no_grad():
         model.gauss_params["means"] = torch.nn.Parameter(model.gauss_params["means"].clone())
     assert show() == 7
-    assert len(model._replay._frames) == 1
+    assert len(model._replay._frames._graphs) == 1
     model.step = 0  # fewer bands of the harmonics take part
     assert show() == 8
     model.config.rasterize_mode = "antialiased"
@@ -196,7 +196,7 @@ def test_nothing_is_recorded_on_a_cpu_or_in_training(model, view, monkeypatch):
 def eager(model, camera):
     model._replay = FrameReplay()
     outputs = model.get_outputs_for_camera(camera)
-    assert len(model._replay._frames) == 0
+    assert len(model._replay._frames._graphs) == 0
     return {name: outputs[name] for name in frames.REPLAYED}
 
 
@@ -214,7 +214,7 @@ def test_what_is_played_back_is_what_would_be_rendered(build, perturb, camera, h
     for _ in range(RECORD_AT):
         model.get_outputs_for_camera(cameras[0])
     shown = [model.get_outputs_for_camera(cam) for cam in cameras]
-    assert len(replayed._frames) == 1
+    assert len(replayed._frames._graphs) == 1
     assert replayed._can_record
     for found, truth in zip(shown, expected, strict=True):
         for name, picture in truth.items():
@@ -233,7 +233,7 @@ def test_what_is_trained_meanwhile_is_seen(build, perturb, camera, view):
         for value in model.head.parameters():
             value += 0.02
     after = view(model, times=1)["rgb"]
-    assert len(model._replay._frames) == 1
+    assert len(model._replay._frames._graphs) == 1
     assert not torch.equal(after, before)
     torch.testing.assert_close(after, eager(model, camera())["rgb"], rtol=0, atol=2e-3)
     with torch.no_grad():  # a prune

@@ -255,7 +255,7 @@ def test_photos_are_the_training_images_with_their_views_and_masks(build, traini
     image["image"][..., 3] = 255
     image["image"][:, :7, 3] = 100
     cameras = {"cameras": lambda indices: [(camera(), image) for _ in indices]}
-    run._pipeline.datamanager = SimpleNamespace(train_indices=[0], cached_train=[image], **cameras)
+    run._datamanager = SimpleNamespace(train_indices=[0], cached_train=[image], **cameras)
     (photo,) = run.photos()
     expected = torch.ones(32, 40, dtype=torch.bool)
     expected[:4] = expected[:, :7] = False

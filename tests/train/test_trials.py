@@ -25,7 +25,7 @@ VIEW = HeldOutQuality(10, 20.0, 0.5)
 
 
 class FakeRun:
-    """A run whose steps add 1 to every centre."""
+    """A run whose steps add 1 to every centre and to the poses of cameras."""
 
     def __init__(self, state):
         self.state = state
@@ -40,6 +40,7 @@ class FakeRun:
         for number in range(1, most + 1):
             self.state.step += 1
             self.state.gaussians["means"].data += 1
+            self.state.optimizers["camera_opt"].param_groups[0]["params"][0].data += 1
             if trials.advance(self):
                 return number
         return most
@@ -57,6 +58,7 @@ def run(build, monkeypatch):
     state.gaussians["means"].data.zero_()
     state.optimizers = {name: Adam([value]) for name, value in state.gaussians.items()}
     state.optimizers["compensation"] = Adam(state.head.parameters())
+    state.optimizers["camera_opt"] = Adam([torch.nn.Parameter(torch.zeros(3, 6))])
     return FakeRun(state)
 
 
@@ -89,6 +91,7 @@ def test_trials_of_several_lengths_go_back_to_any_kept_field(run):
     assert (height(run), trials.taken_back, age()) == (0.0, 3 + 2 + 5, 0)
     trials.go_back("second", state)  # its five steps count again
     assert (height(run), trials.taken_back, age()) == (5.0, 5, 5)
+    assert (state.optimizers["camera_opt"].param_groups[0]["params"][0] == 5).all()
     trials.end(run, "count")
     assert (run.held_out, trials.trial, trials.kept) == ([], None, {})
 
