@@ -139,10 +139,9 @@ class Gaussians(UserDict[str, Any]):
 def concatenated(parts: Sequence[Mapping[str, Tensor]], names: Sequence[str] = SPLAT_NAMES) -> dict[str, Tensor]:
     """Parameters of the Gaussians of one or more parts ``[N, ...]``, by name; missing SH degrees are zero."""
     most = max(part["features_rest"].shape[1] for part in parts)
-    values = {name: [part[name] for part in parts] for name in names}
-    rows = values["features_rest"]
-    values["features_rest"] = [torch.nn.functional.pad(rest, (0, 0, 0, most - rest.shape[1])) for rest in rows]
-    return {name: torch.cat(of_parts) for name, of_parts in values.items()}
+    lists = {name: [part[name] for part in parts] for name in names}
+    lists["features_rest"] = [torch.nn.functional.pad(r, (0, 0, 0, most - r.shape[1])) for r in lists["features_rest"]]
+    return {name: torch.cat(tensors) for name, tensors in lists.items()}
 
 
 def as_gaussians(params: Mapping[str, Any]) -> Gaussians:

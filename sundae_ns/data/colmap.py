@@ -89,11 +89,15 @@ def read_images(model: Path, kinds: Sequence[str] = ("txt", "bin")) -> dict[int,
                 raise DataError(f"{where}: its number or its name {file!r:.80} is listed twice; remove one of the two")
             images[number] = ColmapImage(file, pose, camera, cameras[camera])
     other = read_images(model, ["bin"]) if len(present) > 1 else images
-    if other.keys() != images.keys() or any(math.dist(other[n].pose, images[n].pose) > 0.01 for n in images):
+    if other.keys() != images.keys() or any(math.dist(_numbers(other[n]), _numbers(images[n])) > 0.01 for n in images):
         raise DataError(f"{model} holds a text and a binary model that differ; remove the outdated one")
     if not images:
         raise DataError(f"{model} has no images; the reconstruction failed, run it again")
     return images
+
+
+def _numbers(image: ColmapImage) -> tuple[float, ...]:
+    return (*image.pose, *image.camera[:2], *image.camera.intrinsics, *image.camera.lens.distortion)
 
 
 def read_points(model: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:

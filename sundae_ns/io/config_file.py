@@ -143,8 +143,8 @@ def _make_plain(loader: _ValueLoader, suffix: str, node: yaml.Node) -> Any:
 _ValueLoader.add_multi_constructor(_PYTHON, _make_plain)
 
 
-def _value(path: Path, *keys: str) -> Any:
-    """A plain value of a ``config.yml``, or None; ``CheckpointError`` if the file cannot be read."""
+def value_of(path: Path, *keys: str) -> Any:
+    """The plain value of a ``config.yml`` below these keys, or None; ``CheckpointError`` if the file cannot be read."""
     value = _read(path, _ValueLoader)
     for key in keys:
         value = value.get(key) if isinstance(value, dict) else None
@@ -153,19 +153,14 @@ def _value(path: Path, *keys: str) -> Any:
 
 def model_options(path: Path) -> dict[str, Any]:
     """Options of the model in a run's ``config.yml``; ``CheckpointError`` if it is no configuration of a run."""
-    if not isinstance(options := _value(path, "pipeline", "model"), dict):
+    if not isinstance(options := value_of(path, "pipeline", "model"), dict):
         raise CheckpointError(f"{path} is not a run's config.yml; give the folder of a run")
     return options
 
 
-def orientation_of(path: Path) -> Any:
-    """Orientation method of a run's data parser; None if it states none."""
-    return _value(path, "pipeline", "datamanager", "dataparser", "orientation_method")
-
-
 def capture_and_source(path: Path) -> tuple[Path | None, Path | None]:
     """Paths of a run's capture and of the checkpoints that it resumes; ``CheckpointError`` if it cannot be read."""
-    options = _value(path)
+    options = value_of(path)
     values = (options.get(name) if isinstance(options, dict) else None for name in ("data", "load_dir"))
     capture, source = (Path(*map(str, parts)) if isinstance(parts, list) and parts else None for parts in values)
     return capture, source
@@ -173,7 +168,7 @@ def capture_and_source(path: Path) -> tuple[Path | None, Path | None]:
 
 def schedule_length(path: Path) -> int:
     """Number of steps of a run's schedule; ``CheckpointError`` if it is no configuration of a run of ours."""
-    if not isinstance(length := _value(path, "schedule_length"), int):
+    if not isinstance(length := value_of(path, "schedule_length"), int):
         raise CheckpointError(f"{path} states no length of its schedule; give a run of sundae")
     return length
 

@@ -16,7 +16,7 @@ from sundae_ns.core.gaussians import FEATURES
 from sundae_ns.data.capture import read_json
 from sundae_ns.head.head import SIZES, CompensationHead, HeadConfig
 from sundae_ns.io import checkpoint, formats
-from sundae_ns.io.config_file import find_config, model_options, orientation_of
+from sundae_ns.io.config_file import find_config, model_options, value_of
 from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.io.ply import Marks
 from sundae_ns.io.run_folder import FRAME_FILE
@@ -136,6 +136,7 @@ def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -
         degree = int(loaded["step"]) // max(interval, 1)  # training did not reach higher ones
         gaussians["features_rest"] = gaussians["features_rest"][:, : (degree + 1) ** 2 - 1]
     gaussians = formats.usable(gaussians, source).gaussians
+    orientation = value_of(config, "pipeline", "datamanager", "dataparser", "orientation_method")
     frame: dict[str, Any] = {}
     with suppress(DataError):
         frame = read_json(config.parent / FRAME_FILE)
@@ -145,7 +146,7 @@ def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -
         background_color=options.get("background_color", "random"),
         antialiased=options.get("rasterize_mode") == "antialiased",
         trained_focal=(float(focal[0]), float(focal[1])) if head is not None and focal else None,
-        up=(0.0, 0.0, 1.0) if orientation_of(config) in ("up", "vertical") else None,
+        up=(0.0, 0.0, 1.0) if orientation in ("up", "vertical") else None,
         in_model_frame=True,
         meta={"source": {"step": int(loaded["step"])}, **({"frame": frame} if is_frame(frame) else {})},
     )

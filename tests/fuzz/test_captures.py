@@ -190,6 +190,11 @@ def _twice(model):
     (model / "cameras.bin").write_bytes(struct.pack("<Q", 2) + (model / "cameras.bin").read_bytes()[8:] * 2)
 
 
+def _other_lens(model):
+    write_text_model(model, sorted(path.name for path in (model.parents[1] / "images").iterdir()))
+    _patch("cameras.bin", 8 + 24, "<d", 19.0)(model)
+
+
 _NAME = 8 + 64 + len("frame_00001.png") + 1  # offset of the first image's number of observations
 ROW = "1 1 0 0 0 0 0 3 1"
 MODELS = {
@@ -221,6 +226,7 @@ MODELS = {
     "a number twice": (lambda model: _text(model, f"{ROW} a.png\n\n{ROW} b.png"), "image 1: .* is listed twice"),
     "a name twice": (lambda model: _text(model, f"{ROW} a.png\n\n2{ROW[1:]} a.png"), "image 2: .*'a.png' is .* twice"),
     "another text": (lambda model: write_text_model(model, ["a.png"]), "a text and a binary model that differ; remove"),
+    "another lens": (_other_lens, "a text and a binary model that differ; remove"),
     "a folder in its place": (lambda model: ((file := model / "cameras.bin").unlink(), file.mkdir()), "cannot be read"),
     "invalid UTF-8": (lambda model: (model / "cameras.txt").write_bytes(b"1 PIN\xff\xfe"), "cameras.txt .*utf-8"),
     "a pose of 6 numbers": (lambda model: _text(model, "1 1 0 0 0 0 0 1 a.png"), "images.txt .*6 numbers as its pose"),
