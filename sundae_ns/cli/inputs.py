@@ -17,7 +17,7 @@ from rich.console import Console
 from torch import Tensor
 
 from sundae_ns.cli.options import SceneDetails, Wishes
-from sundae_ns.cli.refusals import check_file, check_suffix
+from sundae_ns.cli.refusals import check_file, check_least, check_suffix
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import ConfigError, DataError, SundaeError
 from sundae_ns.core.files import write_bytes
@@ -188,6 +188,7 @@ class Edit(NamedTuple):
 def opened(source: Path, wishes: Wishes, details: SceneDetails, *, capture: bool = False, most: int = 100) -> Edit:
     """A scene before its wishes, with up, start and cameras of its details; ``capture`` asks for ``most`` of a run."""
     wishes.check_wishes()
+    check_least(seed=(details.seed, 0))
     if details.preview is not None:
         if wishes.remove_floaters is None:
             raise ConfigError("--preview shows what --remove-floaters changes; add it")

@@ -56,6 +56,7 @@ REFUSALS = {
     "export a.glb -o a.ply": "a.glb is not a complete .glb with Gaussians",
     "pack in.sundae -o a.sundae --finetune 9": "in.sundae is a packed scene without photos; leave out",
     "pack in.ply -o a.sundae --finetune 9": "in.ply is a .ply file without photos; leave out",
+    "pack in.ply -o a.sundae --seed -5": "seed is -5; give at least 0",
     "pack in.ply -o a.sundae --start-view 0": "there is no camera 0 in the scene; give a camera file",
     "pack in.ply -o a.sundae --target-drop 1": "leave out --target-drop, or give a run",
     "prune gone -o a.ply --remove-floaters 15e-1": "remove-floaters is 1.5; give 0 (careful) to 1",
