@@ -54,3 +54,8 @@ def test_one_version_everywhere():
     version = PROJECT["version"]
     assert sundae_ns.__version__ == version
     assert re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)[1] == version
+    lowest, above = re.fullmatch(r">=(3\.\d+),<(3\.\d+)", PROJECT["requires-python"]).groups()
+    minors = range(int(lowest[2:]), int(above[2:]))
+    claimed = [word for word in PROJECT["classifiers"] if word.startswith("Programming Language :: Python ::")]
+    assert claimed == [f"Programming Language :: Python :: 3.{minor}" for minor in minors]
+    assert f"Python {' and '.join(f'3.{minor}' for minor in minors)}" in (ROOT / "README.md").read_text()

@@ -230,7 +230,7 @@ class Trials(Callback):
         needed = ["start"] if progress.stage in ("count", "tenth", "head", "length") else []
         if progress.stage == "head":
             needed += [row.head for row in progress.of("head")]
-        if not all(isinstance(self.kept.get(name), Mapping) for name in needed):
+        if not all(isinstance(kept := self.kept.get(name), Mapping) and "head" not in kept for name in needed):
             raise CheckpointError("the checkpoint lacks a field that its trials would return to; give another")
 
     def trains(self, state: TrainingState) -> bool:

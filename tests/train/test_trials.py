@@ -213,12 +213,12 @@ def undecided(build):
 def saved(state, stage="", kept=(), **progress):
     """A state of trials."""
     trials = trials_for(state)
-    trials.progress, trials.kept = Progress(stage, **progress), {name: {} for name in kept}
+    trials.progress, trials.kept = Progress(stage, **progress), dict(kept)
     trials.trial = Trial(10, num_features=5, counts=False) if stage else None
     return trials.state_dict()
 
 
-@pytest.mark.parametrize(("stage", "kept"), [("head", ("start",)), ("count", ()), ("length", ("plain",))])
+@pytest.mark.parametrize(("stage", "kept"), [("head", {"start": {}}), ("count", {"start": {"head": {}}})])
 def test_a_state_without_a_decision_or_a_field_to_go_back_to_is_refused(undecided, stage, kept):
     model, trials = undecided
     with pytest.raises(CheckpointError, match=r"--pipeline.model.head.mode"):
@@ -231,7 +231,7 @@ def test_a_state_without_a_decision_or_a_field_to_go_back_to_is_refused(undecide
 def test_only_trials_do_without_mirrored_images(undecided):
     """They are too short to see what these bring; a run that resumes in a trial goes on with it."""
     model, trials = undecided
-    for options, mirrored in (({"stage": "head", "kept": ("start",)}, False), ({"chosen": {"head": "head"}}, True)):
+    for options, mirrored in (({"stage": "head", "kept": {"start": {}}}, False), ({"chosen": {"head": "head"}}, True)):
         trials.load_state_dict(model.state, saved(model.state, **options))
         model.step = 10**6
         assert model.state.head_enabled
