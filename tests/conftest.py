@@ -27,7 +27,6 @@ from sundae_ns.core.errors import BackendError
 from sundae_ns.cuda import kernels
 from sundae_ns.cuda.kernels import Argument, Launch
 
-CompileKernels = Callable[..., dict[str, Launch]]
 Once = Callable[[str, Callable[[Path], None]], Path]
 
 # Imports leave a million objects. To look for garbage among them as often as usual takes a fifth of the tests' time.
@@ -155,7 +154,7 @@ def compile_for_cpu(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., c
 
 
 @pytest.fixture(scope="session")
-def load_on_cpu(compile_for_cpu: Callable[..., ctypes.CDLL]) -> CompileKernels:
+def load_on_cpu(compile_for_cpu: Callable[..., ctypes.CDLL]) -> Callable[..., dict[str, Launch]]:
     """As ``kernels.load_kernels``, but for the CPU."""
 
     def compile_them(file: str, names: Sequence[str], options: Sequence[str], *_: object) -> dict[str, Launch]:

@@ -57,7 +57,8 @@ def poses(photos: Input, out: Out, options: Plain[PoseOptions] = PoseOptions()) 
         print(f"# this is the largest of {len(placed.models)} models that do not join; others have {others} photos")
     if placed.left_out:
         names = ", ".join(placed.left_out[:3]) + (", ..." if len(placed.left_out) > 3 else "")
-        print(f"# {'warning: ' * (not placed.enough)}without a pose: {names}; to add them, {placed.again}", flush=True)
+        warning = "" if placed.enough else "warning: "
+        print(f"# {warning}without a pose: {names}; to add them, {placed.again}", flush=True)
     return 0
 
 

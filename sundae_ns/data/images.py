@@ -63,7 +63,8 @@ def opened(path: Path) -> Image.Image:
         image.close()
         content = path.read_bytes()  # of a file, Pillow asks for as many bytes as a chunk states
         image = Image.open(BytesIO(content))
-        image.info |= {"deep": content} if content[24] == 16 else {}  # bits a channel, of which Pillow reads 8
+        if content[24] == 16:  # the bit depth, which Pillow reduces to 8
+            image.info["deep"] = content
         if (at := content.find(b"\0\0\0\4cICP", 0, max(content.find(b"IDAT"), 0))) >= 0:
             image.info["cicp"] = content[at + 8 : at + 12]
     elif "progressive" in image.info and (scans := path.read_bytes().count(b"\xff\xda")) > 200:  # each takes its time
@@ -156,8 +157,9 @@ def _conversion(image: Image.Image) -> Callable[[Image.Image], Any] | None:
         return None
 
     def convert(base: Image.Image) -> Image.Image:
-        values = np.asarray(base.convert("RGB"))
-        if "deep" in image.info:
+        if "deep" not in image.info:
+            values = np.asarray(base.convert("RGB"))
+        else:
             cv2: Any = importlib.import_module("cv2")  # takes 0.1 s
             flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
             values = cv2.imdecode(np.frombuffer(image.info["deep"], np.uint8), flags)[..., ::-1]

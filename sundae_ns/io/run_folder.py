@@ -75,14 +75,26 @@ def _in_training(run: Path) -> bool:
     return False
 
 
-def prunes_of(run: Path, before: int | None = None) -> list[dict[str, Any]]:
-    """Records of the prunes of a run, given its folder, or of those before a step; empty if they cannot be read."""
+def prunes_of(run: Path) -> list[dict[str, Any]]:
+    """Records of the prunes of a run, given its folder; empty if they cannot be read."""
     try:
         records = json.loads(regular(run / PRUNES).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return []
-    known = records if isinstance(records, list) and all(isinstance(record, dict) for record in records) else []
-    return known if before is None else [x for x in known if isinstance(x.get("step"), int) and x["step"] < before]
+    return records if isinstance(records, list) and all(isinstance(record, dict) for record in records) else []
+
+
+def prunes_before(path: Path, step: int) -> list[dict[str, Any]]:
+    """Records of a ``prune.json`` before a step; empty without such a file.
+
+    A file that cannot be read is renamed to ``*.damaged.json``, because it should not end a training.
+    """
+    try:
+        with suppress(FileNotFoundError):
+            return [record for record in json.loads(regular(path).read_text(encoding="utf-8")) if record["step"] < step]
+    except (ValueError, TypeError, KeyError, RecursionError):
+        path.replace(path.with_suffix(".damaged.json"))
+    return []
 
 
 def take_records(source: Path, run: Path, step: int) -> None:
@@ -90,7 +102,8 @@ def take_records(source: Path, run: Path, step: int) -> None:
 
     Damaged records are passed over; a record that the other run has is kept. ``StorageError`` without space or rights.
     """
-    if (before := prunes_of(source, step + 1)) and not (run / PRUNES).exists():
+    before = [prune for prune in prunes_of(source) if isinstance(prune.get("step"), int) and prune["step"] <= step]
+    if before and not (run / PRUNES).exists():
         write_text(run / PRUNES, json.dumps(before, indent=2))
 
 

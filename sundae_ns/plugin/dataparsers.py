@@ -79,7 +79,8 @@ def check_capture(parser: DataParserConfig, data: Path, splits: Sequence[str], *
     if isinstance(parser, ColmapDataParserConfig):
         if not (model := data / parser.colmap_path).is_dir():
             raise no_model(data, parser.colmap_path)
-        parser.load_3D_points &= any(model.glob("points3D.*"))  # without, the model warns, and starts from random ones
+        if parser.load_3D_points and not any(model.glob("points3D.*")):
+            parser.load_3D_points = False  # the model then warns, and starts from random points
         check_colmap(model, data / parser.images_path if images else None, points=parser.load_3D_points)
     elif isinstance(parser, NerfstudioDataParserConfig):
         path = data if data.suffix == ".json" else data / "transforms.json"

@@ -193,11 +193,14 @@ def _datamanager_config(stock: DataManagerConfig) -> SundaeDatamanagerConfig:
 
 
 def kept_and_seconds(prunes: list[dict[str, Any]]) -> tuple[float | None, float | None]:
-    """Ratio of Gaussians that all prunes kept, and their seconds; None if the record is not whole."""
-    with suppress(KeyError, TypeError, ValueError, ArithmeticError):
-        if prunes:
-            return math.prod(x["after"] / x["before"] for x in prunes), sum(float(x["seconds"]) for x in prunes)
-    return None, None
+    """Ratio of Gaussians that all prunes kept, and their seconds; None where the record is not whole."""
+    kept = seconds = None
+    if prunes:
+        with suppress(KeyError, TypeError, ArithmeticError):
+            kept = math.prod(prune["after"] / prune["before"] for prune in prunes)
+        with suppress(KeyError, TypeError, ValueError, ArithmeticError):
+            seconds = sum(float(prune["seconds"]) for prune in prunes)
+    return kept, seconds
 
 
 def _shared(config: Any, kind: type[Any]) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from sundae_ns.core.files import write_text
 from sundae_ns.core.share import Share
 from sundae_ns.core.tables import without_nan
 from sundae_ns.core.timing import now, peak_memory
-from sundae_ns.io.run_folder import PRUNES, prunes_of
+from sundae_ns.io.run_folder import PRUNES, prunes_before
 from sundae_ns.pruning.decision import Pruner
 from sundae_ns.pruning.floaters import MOST_FLOATERS, near_cameras
 from sundae_ns.pruning.rule import PruneRule, ScoreName, kept_count
@@ -267,7 +267,7 @@ class ScheduledPruning(Callback):
         run.log_scalars("Prune", {name: report[name] for name in ("before", "after", "seconds", "peak")})
         if run.folder is not None:
             # A run that was killed between a prune and the next save repeats that prune.
-            earlier = prunes_of(run.folder, report["step"])
+            earlier = prunes_before(run.folder / PRUNES, report["step"])
             write_record(run, PRUNES, [*earlier, {**report, "warm_up": before, "pruned": after}])
 
     def finish(self, run: TrainingRun) -> None:

@@ -146,8 +146,7 @@ def _call(name, arguments):
 
 _GIGABYTES = b"(\x8a\x05\x00\x00\x00\x00\x01t"  # the tuple of 2^32
 _2_GB = _call(b"numpy\ndtype", b"(X\x0b\x00\x00\x00V2000000000t")
-_TEXT = b"X\x04\x00\x00\x00abcd"
-_HEX = b"X\x03\x00\x00\x00hex"
+_TEXTS = b"X\x04\x00\x00\x00abcdX\x03\x00\x00\x00hex"
 
 
 def _key(levels):
@@ -165,7 +164,7 @@ WRONG = {
     "four gigabytes of bytes": (_pickled(_call(b"builtins\nbytearray", _GIGABYTES)), "more than tensors .*bytearray"),
     "four gigabytes of numbers": (_pickled(_call(b"torch\nFloatTensor", _GIGABYTES)), "more than .*FloatTensor"),
     "a storage of four gigabytes": (_pickled(_call(b"torch.storage\nUntypedStorage", _GIGABYTES)), "UntypedStorage"),
-    "bytes that double": (_pickled(_call(b"_codecs\nencode", b"(" + _TEXT + _HEX + b"t")), "the codec hex"),
+    "bytes that double": (_pickled(_call(b"_codecs\nencode", b"(" + _TEXTS + b"t")), "the codec hex"),
     "a number of 2 GB": (_pickled(b"cnumpy.core.multiarray\nscalar\n(", _2_GB, b"tR"), "not a checkpoint"),
     "missing": (lambda path: None, "does not exist"),
     "a device": (lambda path: path.symlink_to("/dev/zero"), "it is a pipe or a device, not a file"),

@@ -8,7 +8,7 @@ import pytest
 from sundae_ns.core.errors import StorageError
 from sundae_ns.core.files import locked
 from sundae_ns.io.config_file import find_config
-from sundae_ns.io.run_folder import LOCK, files_of, new_name, prunes_of, reserve, take_records
+from sundae_ns.io.run_folder import LOCK, files_of, new_name, prunes_before, prunes_of, reserve, take_records
 
 
 def test_the_configuration_is_found_from_any_path_of_its_run(tmp_path):
@@ -58,6 +58,8 @@ def test_records_follow_a_resumed_run(tmp_path):
     old.mkdir()
     take_records(old, tmp_path / "none", 9)  # there are none
     (old / "prune.json").write_text('[{"step": 3, "after": 9}, {"step": 5, "after": 4}, {"step": 8, "after": 2}]')
+    assert prunes_before(old / "prune.json", 8) == prunes_of(old)[:2]
+    assert prunes_before(tmp_path / "prune.json", 5) == prunes_of(tmp_path) == []
     for step, prunes in ((2, []), (5, [3, 5]), (8, [3, 5, 8])):
         new = tmp_path / f"resumed-after-{step}"
         new.mkdir()
@@ -73,8 +75,11 @@ DAMAGED = ("[", "[" * 100_000, "", "3", '"step"', "[3]", "\x00", '{"before": 9}'
 
 @pytest.mark.parametrize("text", [*DAMAGED, '[{"before": 9}]', '[{"step": "3"}]'])
 def test_damaged_records_end_no_training(tmp_path, text):
-    (tmp_path / "prune.json").write_text(text)
+    path = tmp_path / "prune.json"
+    path.write_text(text)
     assert prunes_of(tmp_path) == ([] if text in DAMAGED else json.loads(text))
     take_records(tmp_path, tmp_path / "none", 9)
     assert not (tmp_path / "none").exists()
-    assert prunes_of(tmp_path, 7) == []
+    assert path.read_text() == text
+    assert prunes_before(path, 7) == []
+    assert [(left.name, left.read_text()) for left in tmp_path.iterdir()] == [("prune.damaged.json", text)]

@@ -192,7 +192,8 @@ def test_runs_that_cannot_be_packed(tmp_path):
         ([{"before": 100, "after": 50, "seconds": 1}, {"before": 80, "after": 40, "seconds": 0.5}], (0.25, 1.5)),
         ([], (None, None)),
         ([{"before": 100, "after": 50, "seconds": 1}, {"after": 40}], (None, None)),
-        ([{"before": 0, "after": 0, "seconds": 1}], (None, None)),
+        ([{"before": 0, "after": 0, "seconds": 1}], (None, 1)),
+        ([{"before": "many", "after": 1, "seconds": "long"}], (None, None)),
         ([{"before": 1, "after": 10**400, "seconds": 10**400}], (None, None)),
     ],
 )

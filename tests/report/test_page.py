@@ -30,7 +30,6 @@ from sundae_ns.report.report_page import (
 from sundae_ns.train.curve import CountCurve, CurvePoint
 
 HOSTILE = """"'></h4><script>window.harmed = 1</script><img src=x onerror='window.harmed = 1'>{{ 7*7 }}&amp;"""
-VOID = {"meta", "img", "input", "br", "link"}
 LOSSES = {9000: 0.0, 3000: 0.1, 1000: 1.0}
 POINTS = (CurvePoint(n, None, 26 - loss, 0.9 - loss / 20, loss, loss / 20, 0.05, 0.001) for n, loss in LOSSES.items())
 CURVE = CountCurve(3000, 9000, f"the smallest within 0.1 dB {HOSTILE}", tuple(POINTS))
@@ -49,7 +48,7 @@ class Page(HTMLParser):
     def handle_starttag(self, tag, attrs):
         assert len(dict(attrs)) == len(attrs), "an attribute stands twice"
         self.elements.append((tag, dict(attrs)))
-        if tag not in VOID:
+        if tag not in {"meta", "img", "input", "br", "link"}:
             self.open.append(tag)
 
     def handle_endtag(self, tag):

@@ -54,10 +54,6 @@ def write_columns(path: Path, columns: Mapping[str, np.ndarray], **options: Any)
     PlyData([PlyElement.describe(rows, "vertex")], **options).write(str(path))
 
 
-def _bytes(shares: Tensor) -> np.ndarray:
-    return (shares * 255).round().clamp(0, 255).numpy().astype(np.uint8)
-
-
 def colors_of(gaussians: Mapping[str, Tensor]) -> Tensor:
     """View-independent colours ``[N, 3]``."""
     return 0.5 + SH_C0 * gaussians["features_dc"]
@@ -66,7 +62,8 @@ def colors_of(gaussians: Mapping[str, Tensor]) -> Tensor:
 def write_splat(path: Path, gaussians: Mapping[str, Tensor]) -> None:
     rows = np.zeros(len(gaussians["means"]), [("m", "<f4", 3), ("s", "<f4", 3), ("c", "u1", 4), ("q", "u1", 4)])
     rows["m"], rows["s"] = gaussians["means"].numpy(), gaussians["scales"].exp().numpy()
-    rows["c"] = _bytes(torch.cat([colors_of(gaussians), gaussians["opacities"].sigmoid()], dim=1))
+    shares = torch.cat([colors_of(gaussians), gaussians["opacities"].sigmoid()], dim=1)
+    rows["c"] = (shares * 255).round().clamp(0, 255).numpy().astype(np.uint8)
     rows["q"] = (gaussians["quats"] * 128 + 128).round().clamp(0, 255).numpy().astype(np.uint8)
     path.write_bytes(rows.tobytes())
 

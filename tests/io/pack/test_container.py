@@ -19,7 +19,6 @@ from sundae_ns.io.pack.container import FORMAT, LIMITS, fault, parsed
 from sundae_ns.io.pack.packed_scene import fit_scene, read_scene, write_fitted
 from sundae_ns.scene.scene import Background
 
-SCHEMAS = ("container", "header", "model")
 HEAD = {"mode": "residual", "size": "tiny", "pixel_unshuffle": 1, "num_features": 3, "precision": "bf16"}
 MODEL = {"sh_degree": 2, "rasterize_mode": "classic", "background_color": "black"}
 MODEL |= {"head": HEAD, "trained_focal": [5, 6]}
@@ -35,11 +34,10 @@ START = {"pose": POSE, "intrinsics": [9, 9.5, -3, 0], "size": [640, 480.0]}
 HEADER = {"primitives": 40, "attributes": ATTRIBUTES, "source": {"method": "sundae"}}
 HEADER |= {"up": [0, 0.6, -0.82], "start": START}
 SECTION = {"name": "means/low", "dtype": "<f4", "shape": [1, 3], "parts": [3, 3, 3, 3], "sha256": 64 * "0"}
-CONTAINER = {"sections": [SECTION, {**SECTION, "name": "means/high"}]}
-VALID = {"container": CONTAINER, "header": HEADER, "model": MODEL}
+VALID = {"container": {"sections": [SECTION, {**SECTION, "name": "means/high"}]}, "header": HEADER, "model": MODEL}
 
 
-@pytest.mark.parametrize("schema", SCHEMAS)
+@pytest.mark.parametrize("schema", VALID)
 def test_valid_values_pass(schema):
     assert fault(VALID[schema], FORMAT[schema]) is None
 
