@@ -24,11 +24,15 @@ class McmcModel(SplatfactoModel):
     config: McmcModelConfig
 
     def populate_modules(self) -> None:
+        cap = self.config.max_gs_num
+        if self.seed_points is not None and len(self.seed_points[0]) > cap:
+            chosen = torch.randperm(len(self.seed_points[0]))[:cap]
+            self.seed_points = tuple(each[chosen] for each in self.seed_points)
         super().populate_modules()
         with torch.no_grad():
             self.gauss_params["opacities"].zero_()
             self.gauss_params["scales"] += math.log(0.1)
-        self.strategy: Any = MCMCStrategy(cap_max=self.config.max_gs_num)
+        self.strategy: Any = MCMCStrategy(cap_max=cap)
         self.strategy.absgrad = False  # splatfacto asks
         self.strategy_state = self.strategy.initialize_state()
 
