@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 RESULTS = Path("benchmarks/results")
-COMMIT = "08a19f60"
+COMMIT = "57509540"
 folder = Path(sys.argv[1])
 
 

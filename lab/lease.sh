@@ -30,7 +30,6 @@ case $1 in
     done < $H/$2
     ls $J | wc -l ;;
   look)
-    for c in bonsai garden; do P=$(cd /tmp; ls -d out/*-$c*/jobs/*/tuned.sundae 2>/dev/null | grep -E "suite|100pct"); [ -z "$P" ] || tar -czf $OUT/packs-$c.tgz -C /tmp $P; done
     tail -n 12 /tmp/logs/queue.log; tar -czf $OUT/out.tgz --exclude="*.ckpt" --exclude="*.tmp" --exclude="events.*" --exclude="*.sundae" --exclude="*.jpg" -C /tmp out logs ;;
   wait)
     touch $J/END; SECONDS=0

@@ -5,7 +5,7 @@
 #   GPUS=2 SLOTS=4 bash lab/lease.sh setup && for p in tests first; do bash lab/lease.sh add lab/$p.plan; done
 #       carry .gpu/wheels .gpu/setup.sh .gpu/gsplat-1.4.0-cp312-torch2.11-cu130-sm90.so.xz .gpu/p5
 #   bash lab/lease.sh look                        carry .gpu/p2
-#   for p in splatfacto films mcmc curves sizes; do bash lab/lease.sh add lab/$p.plan; done        carry .gpu/p1
+#   for p in mcmc curves; do bash lab/lease.sh add lab/$p.plan; done        carry .gpu/p1
 set -eu
 S=../shared/scenes
 bash ../shared/gpu/pack.sh fox
