@@ -1,18 +1,15 @@
-"""Train a field, tiled, on one, two and four GPUs: images a second, quality, memory of a GPU; print a CSV.
+"""Train a field, tiled, on one, two and four GPUs: images a second, quality, memory of a GPU; print CSV rows.
 
-    python benchmarks/multi_gpu.py --data DIR --gpus 1 2 --field warm.ckpt --primitives 10000000
+    python benchmarks/multi_gpu.py --data DIR --gpus 1 2 --field warm.ckpt -o benchmarks/results/multi_gpu.csv
     python benchmarks/multi_gpu.py --data DIR --gpus 1 2 --field some.ply --primitives 2000 --steps 12 --cpu
 
 Runs train ``--steps`` images on copies of the field side by side, without growing or pruning. Each run starts fresh
 processes. Words that this script does not know are options of ``ns-train``. The second line tries it on a CPU.
-The table belongs in results/multi_gpu.csv.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
-import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -23,12 +20,13 @@ import torch.distributed as dist
 
 from harness.job import configure, trainer_of
 from harness.plan import Job, parser_of
+from harness.rows import Rows
 from sundae_ns.core.timing import now
 from sundae_ns.io import checkpoint
 from sundae_ns.io.formats import read_gaussians
 
 WARM = 100
-"""Images before the clock starts: kernels load, and memory is allocated."""
+"""Images before the clock starts, whole batches of 1, 2 and 4 GPUs: kernels load, and memory is allocated."""
 COLUMNS = ("field", "gpus", "device", "primitives", "images", "seconds", "images_per_s", "psnr", "ssim", "peak_mib")
 
 
@@ -50,26 +48,6 @@ def tile(gaussians: dict[str, torch.Tensor], count: int) -> dict[str, torch.Tens
     return tiled
 
 
-class Clock:
-    """Wraps the trainer's iteration: images, and seconds of training alone."""
-
-    def __init__(self, trainer: Any, ranks: int, warm: int) -> None:
-        self.ranks, self.warm, self.images = ranks, warm, 0
-        self.iterate, trainer.train_iteration = trainer.train_iteration, self
-        self.started: float | None = None
-
-    def now(self) -> float:
-        if self.ranks > 1:
-            dist.barrier()
-        return now("cuda" if torch.cuda.is_available() else "cpu")
-
-    def __call__(self, step: int) -> Any:
-        if self.started is None and step >= self.warm and step % self.ranks == 0:
-            self.started = self.now()
-        self.images += self.started is not None
-        return self.iterate(step)
-
-
 def config_of(options: argparse.Namespace, extra: list[str], folder: Path) -> Any:
     data = options.data.resolve()
     job = Job("tiled", "whole", data.name, "tiled", str(data), options.method, options.steps, seed=42)
@@ -82,7 +60,7 @@ def config_of(options: argparse.Namespace, extra: list[str], folder: Path) -> An
 
 
 def measure(rank: int, ranks: int, folder: Path, options: argparse.Namespace, extra: list[str]) -> None:
-    """Train on one of several GPUs; the first writes a row."""
+    """Train on one of several GPUs; the first prints a row, and puts it into the table."""
     cuda = not options.cpu
     if cuda:
         torch.cuda.set_device(rank)
@@ -92,12 +70,25 @@ def measure(rank: int, ranks: int, folder: Path, options: argparse.Namespace, ex
     config = config_of(options, extra, folder)
     config.machine.device_type, config.machine.num_devices = ("cuda" if cuda else "cpu"), ranks
     trainer, _ = trainer_of(config, rank, ranks)
-    clock = Clock(trainer, ranks, WARM if cuda else 0)
+    iterate, warm, started = trainer.train_iteration, WARM if cuda else 0, [0.0]
+    images = options.steps - warm
+    assert images > 0, "too few steps"
+
+    def clock() -> float:
+        if ranks > 1:
+            dist.barrier()
+        return now("cuda" if cuda else "cpu")
+
+    def iteration(step: int) -> Any:
+        if step == warm:
+            started[:] = [clock()]
+        return iterate(step)
+
+    trainer.train_iteration = iteration
     if cuda:
         torch.cuda.reset_peak_memory_stats()
     trainer.train()
-    assert clock.started is not None, "too few steps"
-    seconds = clock.now() - clock.started
+    seconds = clock() - started[0]
     memory: list[Any] = [torch.cuda.max_memory_allocated() / 2**20 if cuda else 0.0] * ranks
     if ranks > 1:
         dist.all_gather_object(memory, memory[0])
@@ -108,11 +99,10 @@ def measure(rank: int, ranks: int, folder: Path, options: argparse.Namespace, ex
             quality = trainer.pipeline.get_average_eval_image_metrics()
             name = f"{options.data.name}, tiled to {options.primitives}"
             device = torch.cuda.get_device_name(0) if cuda else "CPU"
-            figures = (round(seconds, 2), round(clock.images / seconds, 1))
+            figures = (images, round(seconds, 2), round(images / seconds, 1))
             errors = (round(quality["psnr"], 3), round(quality["ssim"], 4))
-            row = (name, ranks, device, trainer.model.source.total, clock.images, *figures, *errors, round(max(memory)))
-            with (folder / "rows.csv").open("a", newline="") as file:
-                csv.writer(file).writerow(row)
+            row = (name, ranks, device, trainer.model.source.total, *figures, *errors, round(max(memory)))
+            Rows(options.out, COLUMNS, COLUMNS[:3]).put(dict(zip(COLUMNS, row, strict=True)))
     if ranks > 1:
         dist.barrier()
         dist.destroy_process_group()
@@ -127,6 +117,7 @@ def main() -> None:
     parser.add_argument("--field", type=Path, required=True, help="a field to tile: a checkpoint or a .ply")
     parser.add_argument("--primitives", type=int, default=10_000_000, help="of the tiled field")
     parser.add_argument("--cpu", action="store_true", help="try it out over gloo")
+    parser.add_argument("-o", "--out", type=Path, help="table of results")
     options, extra = parser.parse_known_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -136,9 +127,6 @@ def main() -> None:
         del gaussians, state
         for ranks in options.gpus:
             torch.multiprocessing.spawn(measure, (ranks, folder, options, extra), nprocs=ranks)
-        rows = (folder / "rows.csv").read_text()
-    csv.writer(sys.stdout).writerow(COLUMNS)
-    print(rows, end="", flush=True)
 
 
 if __name__ == "__main__":
