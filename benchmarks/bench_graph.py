@@ -70,8 +70,8 @@ def measure(points: Tensor, device: str, repeats: int, sample: int) -> dict[str,
         before = torch.cuda.memory_allocated()
         torch.cuda.reset_peak_memory_stats()
     graph = build()
-    response = high_pass(graph, placed)
     peak = round((torch.cuda.max_memory_allocated() - before) / 2**20, 1) if device == "cuda" else None
+    response = high_pass(graph, placed)
     responses = median_ms(partial(high_pass, graph, placed), device=device, warmup=1, repeats=repeats) / 1000
     error, isolated = response_error(placed, response)
     rows = np.linspace(0, len(points) - 1, min(sample, len(points))).astype(int)

@@ -77,7 +77,7 @@ def config_of(kind: str, options: argparse.Namespace, folder: Path) -> TrainerCo
     steps, save_every, _, more = TRAININGS[kind]
     scene = folder / "scene"
     if not scene.exists():
-        write_still_life(scene, train_views=8, test_views=2, width=64, height=64, points=300, samples=1)
+        write_still_life(scene, train_views=8, test_views=2, width=64, height=64, points=300)
     words = f"--max-num-iterations {steps} --steps-per-save {save_every} {COMMON} {more}".split()
     config: TrainerConfig = tyro.cli(AnnotatedBaseConfigUnion, args=["sundae-tiny", "--data", str(scene), *words])
     config.machine.device_type, config.machine.num_devices = options.device, options.gpus

@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from harness.arms import choose_arms
-from harness.plan import Arm, Job, jobs_of_shard, parser_of, plan_scene
+from harness.plan import Arm, Job, parser_of, plan_scene
 from harness.results import Groups, Result, group, mean_of, percent, quality_page, spread
 from harness.rows import read_rows
 from harness.run import Options, Runner, check_out, compare, first_jobs, run_script
@@ -57,7 +57,6 @@ PAPER_ARMS, PAPER_RATIOS = ("sundae", "sundae-no-head", "splatfacto"), (0.01, 0.
 class SuiteOptions(Options):
     """Options of the script; its folder is that of the captures."""
 
-    script = "suite.py"
     arms: tuple[str, ...] = ()
     """files of arms (.yaml), and names of default arms, as of quality.py; those without options train from scratch."""
     keep_ratios: tuple[float, ...] = ()
@@ -68,24 +67,23 @@ class SuiteOptions(Options):
     """measure the paper's scenes, on the images of the sizes that papers use."""
 
 
-def run_suite(options: SuiteOptions, runner: Runner | None = None, console: Console | None = None) -> int:
+def run_suite(options: SuiteOptions, runner: Runner | None = None) -> int:
     """Measure all methods on every capture of a folder; as ``run_quality``, and 1 if a capture is left out."""
-    console = console or Console()
     defaults = (PAPER_ARMS, PAPER_RATIOS) if options.paper else (ARMS, (0.1,))
     options = replace(options, arms=options.arms or defaults[0], keep_ratios=options.keep_ratios or defaults[1])
     arms = choose_arms(options.arms, options.method, options.steps_scale, from_scratch=not options.paper)
     check_out(options.out, reads=[path for path, _ in find_captures(options)] if options.paper else [options.folder])
     plan, left_out = plan_suite(options, arms)
     for scene, reason in left_out.items():
-        console.print(f"[yellow]Left out: {escape(f'{scene}: {reason}')}", highlight=False, soft_wrap=True)
-    captures = {key: scene for scene, key in first_jobs(jobs_of_shard(plan, options.shard)).items()}
+        Console().print(f"[yellow]Left out: {escape(f'{scene}: {reason}')}", highlight=False, soft_wrap=True)
+    captures = {key: scene for scene, key in first_jobs(plan).items()}
 
     def page(results: Sequence[Result], failed: Mapping[str, str]) -> str:
         reasons = {captures.get(key, key): reason for key, reason in failed.items()}
         make = paper_page if options.paper else suite_page
-        return make(results, arms, {**left_out, **reasons}, options.command())
+        return make(results, arms, {**left_out, **reasons})
 
-    code = compare(plan, options, page, runner, console, whole=not options.paper)
+    code = compare(plan, options.out, page, runner, whole=not options.paper)
     return code or int(bool(left_out) and not options.paper)
 
 
@@ -141,7 +139,7 @@ def find_scene(root: Path, scene: str) -> Path:
     return found[0] if found else root / scene
 
 
-def suite_page(results: Sequence[Result], arms: Sequence[Arm], left_out: Mapping[str, str], command: str) -> str:
+def suite_page(results: Sequence[Result], arms: Sequence[Arm], left_out: Mapping[str, str]) -> str:
     """All captures: packed bytes, then the page of ``quality_page``."""
     lines = ["# All methods on every capture", ""]
     if left_out:
@@ -154,10 +152,10 @@ def suite_page(results: Sequence[Result], arms: Sequence[Arm], left_out: Mapping
     if tuned:
         lines += ["", f"With `--finetune {FINETUNE_STEPS}`, as `sundae run` packs on a GPU.", ""]
         lines += _packing(group(tuned, arms), "tuned")
-    return "\n".join([*lines, "", quality_page(results, arms, command)])
+    return "\n".join([*lines, "", quality_page(results, arms)])
 
 
-def paper_page(results: Sequence[Result], arms: Sequence[Arm], left_out: Mapping[str, str], command: str) -> str:
+def paper_page(results: Sequence[Result], arms: Sequence[Arm], left_out: Mapping[str, str]) -> str:
     """The paper's scenes at its keep ratios: measured figures beside printed ones, then :func:`quality_page`."""
     groups = group([result for result in results if result["job"]["kind"] != "warm-up"], arms)
     lines = ["# The paper's scenes", ""]
@@ -170,7 +168,7 @@ def paper_page(results: Sequence[Result], arms: Sequence[Arm], left_out: Mapping
         lines += ["", f"## {title}", "", *_beside_printed(groups, place)]
     if left_out:
         lines += ["", f"Missing: {', '.join(left_out)}."]
-    return "\n".join([*lines, "", quality_page(results, arms, command)])
+    return "\n".join([*lines, "", quality_page(results, arms)])
 
 
 def _beside_printed(groups: Groups, place: int) -> list[str]:

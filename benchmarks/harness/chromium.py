@@ -237,10 +237,10 @@ class Browser:
             time.sleep(seconds / steps)
         self.mouse("mouseReleased", to_x, to_y)
 
-    def key(self, name: str, code: int, text: str = "", modifiers: int = 0) -> None:
+    def key(self, name: str, code: int) -> None:
         """Press and release a key by its DOM name and its virtual key code."""
-        event = {"key": name, "code": name, "windowsVirtualKeyCode": code, "modifiers": modifiers}
-        self.call("Input.dispatchKeyEvent", {"type": "keyDown", **event, **({"text": text} if text else {})})
+        event = {"key": name, "code": name, "windowsVirtualKeyCode": code}
+        self.call("Input.dispatchKeyEvent", {"type": "keyDown", **event})
         self.call("Input.dispatchKeyEvent", {"type": "keyUp", **event})
 
 

@@ -32,7 +32,7 @@ LONGEST = 900.0
 """Seconds after which a process counts as hanging; it takes about ten."""
 
 
-def die() -> None:
+def die(*_: Any, **__: Any) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
@@ -51,10 +51,6 @@ def at(owner: Any, name: str, replaced: Callable[..., Any], calls: Callable[[int
         setattr(owner, name, call)
 
     return prepare
-
-
-def before(*_: Any, **__: Any) -> None:
-    die()
 
 
 def after(original: Callable[..., Any], *arguments: Any, **options: Any) -> None:
@@ -83,26 +79,26 @@ def half_written(_: Callable[..., Any], path: Path) -> None:
 
 SAVES = {
     "save: half written": at(checkpoint.torch, "save", half_saved, lambda n: n),
-    "save: not yet on the disk": at(files, "flush", before, lambda n: 3 * n),
+    "save: not yet on the disk": at(files, "flush", die, lambda n: 3 * n),
     "save: the older one not yet gone": at(checkpoint, "write", after, lambda n: n),
 }
 TRAINING = {
     **SAVES,
-    "prune: deciding": at(decision, "decide", before),
+    "prune: deciding": at(decision, "decide", die),
     "prune: sliced": at(decision, "keep", after),
     "prune: half recorded": at(pruning, "write_text", half_recorded),
 }
 TRIALS = {
     "trial: started": at(trials.Trials, "start", after, lambda n: n),
-    "trial: measuring": at(trials, "measure_held_out", before, lambda n: n),
+    "trial: measuring": at(trials, "measure_held_out", die, lambda n: n),
     "trial: back to the Gaussians before it": at(trials.Trials, "go_back", after),
     "trials: ended": at(trials.Trials, "end", after),
     **SAVES,
 }
 COMMANDS = {
     "half written": at(files, "flush", half_written),
-    "not yet renamed": at(files, "flush", before),
-    "just renamed": at(files, "flush", before, lambda _: 2),
+    "not yet renamed": at(files, "flush", die),
+    "just renamed": at(files, "flush", die, lambda _: 2),
 }
 
 

@@ -1,4 +1,4 @@
-"""Comparisons as data: arms, jobs and shards. Nothing runs here."""
+"""Comparisons as data: arms and jobs. Nothing runs here."""
 
 from __future__ import annotations
 
@@ -155,16 +155,6 @@ def _check(keep_ratios: Shares, seeds: Sequence[int], repeat_at: Shares, own: Sh
     ratios = [*keep_ratios, *own]
     if len(seeds) > 1 and not set(repeat_at) & set(ratios):
         raise ConfigError(f"no keep ratio is repeated with other seeds; let --repeat-at name one of {ratios}")
-
-
-def jobs_of_shard(jobs: Sequence[Job], shard: str) -> list[Job]:
-    """The jobs of a part, ``"2/5"`` for the second of five, with their warm-ups, which parts share."""
-    part, _, parts = shard.partition("/")
-    if not (part.isdecimal() and parts.isdecimal() and 1 <= int(part) <= int(parts)):
-        raise ConfigError(f"{shard!r} is no shard: use i/n with i from 1 to n")
-    own = [job for job in jobs if job.kind != "warm-up"][int(part) - 1 :: int(parts)]
-    keys = {job.key for job in own} | {job.needs for job in own}
-    return [job for job in jobs if job.key in keys]
 
 
 def done_file(out: Path, key: str) -> Path:

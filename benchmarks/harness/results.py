@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import shlex
 import statistics
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -74,9 +76,9 @@ def mean_of(values: Sequence[float | None]) -> float | None:
     return statistics.fmean(known) if known and len(known) == len(values) else None
 
 
-def quality_page(results: Sequence[Result], arms: Sequence[Arm], command: str) -> str:
+def quality_page(results: Sequence[Result], arms: Sequence[Arm]) -> str:
     """The comparison as a page: every way of rendering has a line, its time beside its error."""
-    lines = ["# Comparison of quality", "", f"    {command}", ""]
+    lines = ["# Comparison of quality", "", f"    {shlex.join(['python', *sys.argv])}", ""]
     lines += [
         "Mean over the seeds, ± their standard deviation. Arms that start from the warm-up of a method and a seed",
         "share it; its training comes before theirs. Time, MB and errors of a line are of one rendering. Times are",

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import tyro
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import track
 
-from harness.plan import Job, done_file, job_folder, jobs_of_shard
+from harness.plan import Job, done_file, job_folder
 from harness.results import Result, read_results, write_results
 from sundae_ns.cli.main import exit_with
 from sundae_ns.cli.process import run_logged
@@ -41,8 +40,6 @@ Page = Callable[[Sequence[Result], Mapping[str, str]], str]
 class Options:
     """Options of every comparison."""
 
-    script: ClassVar[str]
-    """Name of the script."""
     folder: Annotated[Path, tyro.conf.Positional]
     """folder of a capture."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
@@ -61,18 +58,6 @@ class Options:
     """use the images of images_2, images_4 ... (COLMAP layout)."""
     steps_scale: float = 1.0
     """factor on all lengths, for a trial."""
-    shard: str = "1/1"
-    """i/n runs the i-th of n parts."""
-
-    def command(self) -> str:
-        """The command of the whole comparison, without the shard."""
-        words = ["python", f"benchmarks/{self.script}", str(self.folder), "-o", str(self.out)]
-        for option in fields(self):
-            value = getattr(self, option.name)
-            values = value if isinstance(value, tuple) else () if value is True else (value,)
-            if value not in ((), False) and option.name not in ("folder", "out", "shard"):
-                words += [f"--{option.name.replace('_', '-')}", *map(str, values)]
-        return shlex.join(words)
 
 
 def check_out(out: Path, *, reads: Iterable[Path]) -> None:
@@ -86,14 +71,12 @@ def check_out(out: Path, *, reads: Iterable[Path]) -> None:
         raise StorageError(f"{out} holds files of something else; choose another folder")
 
 
-def compare(
-    plan: Sequence[Job], options: Options, page: Page, runner: Runner | None, console: Console, *, whole: bool = False
-) -> int:
+def compare(jobs: Sequence[Job], out: Path, page: Page, runner: Runner | None = None, *, whole: bool = False) -> int:
     """Run the jobs and write the tables; the exit code, 1 if a job failed.
 
     ``whole`` captures are left out once their first job has failed.
     """
-    out, jobs = options.out, jobs_of_shard(plan, options.shard)
+    console = Console()
     try:
         failed = run_jobs(jobs, out, runner or spawn, console, whole=whole)
     except KeyboardInterrupt:

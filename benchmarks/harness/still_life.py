@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -22,7 +21,6 @@ def write_still_life(
     width: int = 128,
     height: int = 128,
     points: int = 2000,
-    **_: Any,
 ) -> Path:
     """Write views of the demo's capture, spread evenly around it, as a capture of its own."""
     total, side = train_views + test_views, max(width, height)

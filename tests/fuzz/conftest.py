@@ -19,7 +19,7 @@ from harness.still_life import write_still_life
 @pytest.fixture(scope="session")
 def scene(tmp_path_factory):
     out = tmp_path_factory.mktemp("capture") / "scene"
-    return write_still_life(out, train_views=VIEWS, test_views=1, width=WIDTH, height=HEIGHT, points=40, samples=1)
+    return write_still_life(out, train_views=VIEWS, test_views=1, width=WIDTH, height=HEIGHT, points=40)
 
 
 @pytest.fixture

@@ -38,7 +38,7 @@ def passed():
 @pytest.fixture(scope="session")
 def still_life(tmp_path_factory):
     out = tmp_path_factory.mktemp("still_life") / "scene"
-    return write_still_life(out, train_views=10, test_views=2, width=24, height=24, points=80, samples=1)
+    return write_still_life(out, train_views=10, test_views=2, width=24, height=24, points=80)
 
 
 @pytest.fixture

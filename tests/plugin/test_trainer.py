@@ -293,7 +293,7 @@ def test_the_schedule_is_logged_and_saved(tmp_path, monkeypatch, capsys):
         with pytest.raises((ValueError, RuntimeError), match=says):
             wrong.print_to_terminal()
     assert list(tmp_path.iterdir()) == []
-    write_still_life(tmp_path / "capture", train_views=3, test_views=1, width=16, height=16, points=9, samples=1)
+    write_still_life(tmp_path / "capture", train_views=3, test_views=1, width=16, height=16, points=9)
     config.pipeline.model.refine_every = 0
     with pytest.raises(ConfigError, match="refine-every is 0; give 1 or more"):
         config.print_to_terminal()

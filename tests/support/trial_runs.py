@@ -23,7 +23,7 @@ LENGTH = 5  # Steps of a trial: a twentieth of so short a run. Views are held ou
 
 
 def tiny_scene(folder: Path, cameras: int) -> Path:
-    size = {"width": 24, "height": 24, "points": 200, "samples": 1}
+    size = {"width": 24, "height": 24, "points": 200}
     return write_still_life(folder / str(cameras), train_views=cameras, test_views=2, **size)
 
 
