@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import os
+import re
 from collections.abc import Iterator
 from contextlib import suppress
 from enum import Enum
@@ -20,7 +21,6 @@ from yaml.constructor import ConstructorError
 from sundae_ns.core.errors import CheckpointError, reading, regular
 from sundae_ns.io.formats import PRIMITIVES, kind_of, unread
 
-_PATHS = {"PosixPath", "WindowsPath", "PurePosixPath", "PureWindowsPath"}
 _GROUPS = ("nerfstudio.method_configs", "nerfstudio.dataparser_configs")
 
 
@@ -30,9 +30,11 @@ class _ConfigLoader(yaml.SafeLoader):
 
 @cache
 def _trusted_packages() -> frozenset[str]:
-    """Packages whose classes a configuration may name; nerfstudio imports plug-ins anyway."""
-    plugins = {point.value.partition(":")[0] for group in _GROUPS for point in entry_points(group=group)}
-    return frozenset({"nerfstudio", "sundae_ns", "gsplat", "torch"} | {name.partition(".")[0] for name in plugins})
+    """Packages whose classes a configuration may name; nerfstudio imports plug-ins, its variables' too, anyway."""
+    named = [point.value for group in _GROUPS for point in entry_points(group=group)]
+    for group in _GROUPS:
+        named += re.findall("=([^,]+)", os.environ.get(group.upper().replace(".", "_"), ""))
+    return frozenset({"nerfstudio", "sundae_ns", "gsplat", "torch"} | {re.split("[.:]", name)[0] for name in named})
 
 
 def _refused(node: yaml.Node, reason: str) -> ConstructorError:
@@ -72,8 +74,7 @@ def _make_object(loader: _ConfigLoader, suffix: str, node: yaml.Node) -> Iterato
 def _make_value(loader: _ConfigLoader, suffix: str, node: yaml.Node) -> Any:
     """A path, or a member of an enumeration; other calls are refused."""
     arguments = loader.construct_sequence(node, deep=True) if isinstance(node, yaml.SequenceNode) else []
-    module, _, name = suffix.rpartition(".")
-    if module.partition(".")[0] == "pathlib" and name in _PATHS and all(isinstance(a, str) for a in arguments):
+    if suffix.startswith("pathlib.") and suffix.endswith("Path") and all(isinstance(a, str) for a in arguments):
         return Path(*arguments)
     by_name = suffix == "builtins.getattr"  # as Python before 3.11.4 saves a member of an enumeration
     kind, *value = arguments if by_name and arguments else (_named(suffix, node), *arguments)
@@ -178,8 +179,7 @@ def check_run(run: Path) -> None:
     if (kind := kind_of(run)) == "packed":
         raise CheckpointError(f"{run} is a packed scene; give the run that was packed")
     if kind is not None:
-        advice = "give the folder of a run; sundae prune and sundae export read such files"
-        raise CheckpointError(f"{run} is a {PRIMITIVES[kind]}; {advice}")
+        raise CheckpointError(f"{run} is a {PRIMITIVES[kind]}, which sundae prune and sundae export read; give a run")
     if (reason := unread(run)) is not None:
         raise CheckpointError(f"{run} {reason}")
     model_options(config_of(run))

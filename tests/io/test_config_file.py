@@ -10,6 +10,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.writer import EventName
 
 from sundae_ns.core.errors import CheckpointError
+from sundae_ns.io import config_file
 from sundae_ns.io.config_file import load_config, schedule_length
 from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.plugin.finished_runs import load_model, load_run
@@ -48,6 +49,18 @@ def test_a_run_of_an_early_python_3_11_opens(tmp_path):
     for attribute in ("__class__", "__members__", "3", "[ETA]"):
         path.write_text(f"!!python/object:nerfstudio.engine.trainer.TrainerConfig {{data: {call.format(attribute)}}}")
         refused(load_config, path, kind=CheckpointError)
+
+
+def test_a_method_of_nerfstudios_variable_is_trusted(tmp_path, monkeypatch):
+    path = tmp_path / "config.yml"
+    path.write_text("!!python/object:a_method.Config {}")
+    lines = "import dataclasses", "@dataclasses.dataclass", "class Config:", "    data: int = 7"
+    (tmp_path / "a_method.py").write_text("\n".join(lines))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(config_file, "_trusted_packages", config_file._trusted_packages.__wrapped__)
+    refused(load_config, path, "it names a_method.Config", CheckpointError)
+    monkeypatch.setenv("NERFSTUDIO_METHOD_CONFIGS", "other=nowhere:METHOD,mine=a_method:METHOD")
+    assert load_config(path).data == 7
 
 
 HOSTILE = {

@@ -1,7 +1,10 @@
 """3DGS-MCMC (Kheradmand et al., 2024) as a method of ns-train: stock splatfacto with gsplat's ``MCMCStrategy``.
 
-Registered by NERFSTUDIO_METHOD_CONFIGS=splatfacto-mcmc=mcmc:METHOD. Opacities, scales and the two penalties are those of
-gsplat's own example of the strategy.
+    export NERFSTUDIO_METHOD_CONFIGS=splatfacto-mcmc=mcmc:METHOD PYTHONPATH=benchmarks
+    echo "[{name: mcmc, method: splatfacto-mcmc, options: {pipeline.model.max-gs-num: '50761'}}]" > mcmc.yaml
+    python benchmarks/suite.py CAPTURES -o DIR --arms mcmc.yaml --scenes bonsai --seeds 42 43 44
+
+Opacities, scales and the two penalties are those of gsplat's own example of the strategy.
 """
 
 from __future__ import annotations
@@ -26,8 +29,9 @@ class McmcModel(SplatfactoModel):
     def populate_modules(self) -> None:
         cap = self.config.max_gs_num
         if self.seed_points is not None and len(self.seed_points[0]) > cap:
-            chosen = torch.randperm(len(self.seed_points[0]))[:cap]
-            self.seed_points = tuple(each[chosen] for each in self.seed_points)
+            points, colors = self.seed_points
+            chosen = torch.randperm(len(points))[:cap]
+            self.seed_points = points[chosen], colors[chosen]
         super().populate_modules()
         with torch.no_grad():
             self.gauss_params["opacities"].zero_()
@@ -38,7 +42,8 @@ class McmcModel(SplatfactoModel):
 
     def step_post_backward(self, step: int) -> None:
         lr = self.optimizers["means"].param_groups[0]["lr"]
-        self.strategy.step_post_backward(self.gauss_params, self.optimizers, self.strategy_state, step, self.info, lr=lr)
+        params, state = self.gauss_params, self.strategy_state
+        self.strategy.step_post_backward(params, self.optimizers, state, step, self.info, lr=lr)
 
     def get_loss_dict(self, outputs: Any, batch: Any, metrics_dict: Any = None) -> dict[str, torch.Tensor]:
         losses = super().get_loss_dict(outputs, batch, metrics_dict)
@@ -55,6 +60,6 @@ class McmcModelConfig(SplatfactoModelConfig):
     max_gs_num: int = 1_000_000
 
 
-_config = deepcopy(method_configs["splatfacto"])
+_config: Any = deepcopy(method_configs["splatfacto"])
 _config.method_name, _config.pipeline.model = "splatfacto-mcmc", McmcModelConfig()
 METHOD = MethodSpecification(_config, "splatfacto with gsplat's MCMCStrategy")
