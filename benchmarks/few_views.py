@@ -124,9 +124,10 @@ def main(
     with writing(f"cannot make {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
     for name, (capture, count) in cuts.items():
-        if not (folder / name).exists():
+        note = folder / name / "capture.txt"
+        if not note.parent.exists():
             cut(capture, count, folder / name)
-        elif (of := (folder / name / "capture.txt").read_text(encoding="utf-8")) != str(capture):
+        elif (of := note.read_text(encoding="utf-8") if note.exists() else "an earlier version") != str(capture):
             raise ConfigError(f"{folder / name} is a cut of {of}; choose another --out for {capture}")
     code = run_suite(options)
     record(options.out, table)

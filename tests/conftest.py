@@ -111,6 +111,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(autouse=True)
 def _seed() -> None:
     torch.manual_seed(0)
+    torch.set_default_dtype(torch.float32)  # a test that failed may have left another
     if torch.get_num_threads() != 1:  # a script that an earlier test ran in this process chose its own
         torch.set_num_threads(1)
 

@@ -139,6 +139,8 @@ def _check(driver: ctypes.CDLL, result: int) -> None:
         text = c_char_p()
         driver.cuGetErrorString(result, byref(text))
         reason = text.value.decode() if text.value else f"error {result}"
+        if result == 2:  # CUDA_ERROR_OUT_OF_MEMORY, unlike a missing kernel, may pass
+            raise MemoryExhaustedError("the GPU's memory is full before a kernel is loaded; end other programs on it")
         raise BackendError(f"a CUDA kernel does not run ({reason}): update the driver")
 
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.core.camera import Camera
-from sundae_ns.core.errors import BackendError, ConfigError, DataError, one_line
+from sundae_ns.core.errors import BackendError, ConfigError, DataError, MemoryExhaustedError, one_line
 from sundae_ns.core.gaussians import MAX_SH_DEGREE
 from sundae_ns.core.values import usual_defaults
 from sundae_ns.rasterize import gsplat_kernels
@@ -91,7 +91,7 @@ def harmonic_colors(
     _check_shapes((means, "means", (n, 3)), (features_dc, "features_dc", (n, 3)))
     if len(rest) != 3 or rest[0] != n or rest[1] < needed or rest[2] != 3:
         raise DataError(f"features_rest has shape {list(rest)}; degree {degree} needs [{n}, {needed} or more, 3]")
-    _check_alike("means", means, center=center, features_dc=features_dc, features_rest=features_rest)
+    _check_alike(means, center=center, features_dc=features_dc, features_rest=features_rest)
     backend = backend if n else ReferenceBackend()
     if isinstance(backend, RecordableGsplat):
         check_kernels_take(means)
@@ -129,7 +129,7 @@ def _check(inputs: Inputs) -> None:
     _check_shapes(*((value, name, shapes[name]) for name, value in tensors.items()))
     if colors.dim() != 2 or colors.shape[0] != n or colors.shape[1] < 1:
         raise DataError(f"colors has shape {list(colors.shape)}; pass [{n}, C] with at least one channel")
-    _check_alike("means", inputs.means, colors=colors, **tensors)
+    _check_alike(inputs.means, colors=colors, **tensors)
 
 
 def _check_shapes(*values: tuple[Tensor, str, tuple[int, ...]]) -> None:
@@ -138,14 +138,13 @@ def _check_shapes(*values: tuple[Tensor, str, tuple[int, ...]]) -> None:
             raise DataError(f"{name} has shape {list(value.shape)}; pass {list(shape)}")
 
 
-def _check_alike(name: str, model: Tensor, **others: Tensor) -> None:
-    if model.dtype not in (torch.float32, torch.float64):
-        raise DataError(f"{name} is {model.dtype}; give float32 or float64")
-    for other, value in others.items():
-        if value.dtype != model.dtype or value.device != model.device:
-            raise DataError(
-                f"{other} is {value.dtype} on {value.device} but {name} is {model.dtype} on {model.device}; convert one"
-            )
+def _check_alike(means: Tensor, /, **others: Tensor) -> None:
+    if means.dtype not in (torch.float32, torch.float64):
+        raise DataError(f"means is {means.dtype}; give float32 or float64")
+    for name, value in others.items():
+        if value.dtype != means.dtype or value.device != means.device:
+            first, second = (f"{each.dtype} on {each.device}" for each in (value, means))
+            raise DataError(f"{name} is {first} but means is {second}; convert one")
 
 
 def select_backend(name: BackendName, device: torch.device | str) -> Backend:
@@ -154,7 +153,7 @@ def select_backend(name: BackendName, device: torch.device | str) -> Backend:
     ``auto`` chooses gsplat on a CUDA device where its kernels run, cpu on a CPU where numba works, and else the
     reference. Each check runs once per process; it builds gsplat's kernels if none are prebuilt. Only a CUDA device
     imports gsplat, and only a CPU numba. ``BackendError`` for one that cannot run there, ``ConfigError`` for another
-    name.
+    name, ``MemoryExhaustedError`` if the memory is full.
     """
     device = torch.device(device)
     if name not in ("auto", "gsplat", "cpu", "reference"):
@@ -196,6 +195,8 @@ def _kernel_problem() -> str | None:
     except ImportError as error:
         return f"gsplat does not import ({one_line(error)}); install gsplat"
     except Exception as error:  # a failed build or a missing kernel image raises errors of many kinds
+        if "out of memory" in str(error):  # an error is not cached, and other programs may end
+            raise MemoryExhaustedError(f"the GPU's memory is full ({one_line(error)}); end other programs") from error
         return f"its kernels do not run ({one_line(error)}); install a gsplat wheel for this torch, or nvcc"
     return None
 
@@ -209,6 +210,8 @@ def numba_problem() -> str | None:
         rasterize(Inputs(ones[:, :3], ones, ones[:, :3], ones[:, 0], ones[:, :1], camera), backend=_cpu_backend())
     except ImportError as error:
         return f"numba does not import ({one_line(error)}); pip install numba"
+    except MemoryError as error:
+        raise MemoryExhaustedError(f"the memory is full ({one_line(error)}); end other programs") from error
     except Exception as error:  # versions, processors and settings that numba refuses raise errors of many kinds
         return f"numba does not compile ({one_line(error)}); unset NUMBA_DISABLE_JIT, and install numba again"
     return None

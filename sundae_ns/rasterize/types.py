@@ -84,10 +84,9 @@ def result_of(image: Tensor, alpha: Tensor, means2d: Tensor, radii: Tensor, inpu
 @cache
 def is_gsplat_1_5() -> bool:
     """Whether gsplat 1.5 or newer is installed: a radius for each axis, fitted to the opacity."""
-    try:
+    with suppress(PackageNotFoundError):
         return tuple(map(int, version("gsplat").split(".")[:2])) >= (1, 5)
-    except PackageNotFoundError:
-        return False
+    return False
 
 
 @cache

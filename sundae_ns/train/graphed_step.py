@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sundae_ns.core.errors import BackendError, one_line
+from sundae_ns.core.errors import BackendError, MemoryExhaustedError, one_line
 from sundae_ns.core.gaussians import FEATURES, Gaussians
 from sundae_ns.cuda.adam import Update, adam_step
 from sundae_ns.cuda.cuda_graphs import record, warm_up
@@ -163,7 +163,7 @@ class StepRecordings:
                 inputs.copy_to(recording.inputs)
                 recording.graph.replay()
                 result = recording.result
-        except (BackendError, torch.cuda.OutOfMemoryError) as error:
+        except (BackendError, MemoryExhaustedError, torch.cuda.OutOfMemoryError) as error:
             _log.warning("training continues without recordings, slower: %s", one_line(error))
             self._failed = True
             self.forget()

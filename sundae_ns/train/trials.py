@@ -107,8 +107,8 @@ def packed_size(gaussians: Mapping[str, Tensor], head: torch.nn.Module | None = 
     """
     n = len(gaussians["means"])
     rows = torch.arange(n)
-    if n > SAMPLE:
-        order, _ = scene_order(gaussians["means"].detach().float().cpu().numpy())
+    if n > SAMPLE and (means := gaussians["means"].detach().float().cpu()).isfinite().all():  # else none can be packed
+        order, _ = scene_order(means.numpy())
         rows = torch.from_numpy(order[(n - SAMPLE) // 2 :][:SAMPLE])
     used = {name: value.detach() for name, value in gaussians.items() if head is not None or name != FEATURES}
     sample = {name: value[rows.to(value.device)].float().cpu() for name, value in used.items()}

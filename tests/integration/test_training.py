@@ -311,12 +311,10 @@ def test_what_cannot_be_recorded_runs_as_before_under_every_default_dtype(traine
     for dtype in (torch.float32, torch.float64):
         torch.manual_seed(0)
         torch.set_default_dtype(dtype)
-        try:
-            trainer = trainer_of(max_num_iterations=2)
-            trainer.train()
-            assert torch.get_default_dtype() == dtype
-        finally:
-            torch.set_default_dtype(torch.float32)
+        trainer = trainer_of(max_num_iterations=2)
+        trainer.train()
+        assert torch.get_default_dtype() == dtype
+        torch.set_default_dtype(torch.float32)
         assert trainer._recorded is None
         assert not trainer._recordable()
         results.append(dict(trainer.model.gauss_params))

@@ -9,6 +9,7 @@ import torch
 from splat_inputs import blending_weights, rasterize, rasterize_cameras, several_views
 
 from sundae_ns.core.errors import BackendError, ConfigError, DataError, MemoryExhaustedError
+from sundae_ns.cuda.kernels import _check
 from sundae_ns.rasterize import interface
 from sundae_ns.rasterize import types as limits
 from sundae_ns.rasterize.gsplat_backend import RecordableGsplat
@@ -60,6 +61,16 @@ def test_a_backend_that_cannot_run_is_one_line_and_auto_falls_back(name, device,
     assert select_backend("auto", device).name == instead
     with pytest.raises(ConfigError, match="auto, gsplat, cpu or reference"):
         select_backend("vulkan", device)
+
+
+@pytest.mark.parametrize("call", [interface._kernel_problem, interface.numba_problem, lambda: _check(Mock(), 2)])
+def test_full_memory_is_an_error_at_each_call_and_no_missing_kernel(call, monkeypatch):
+    full = MemoryError() if call is interface.numba_problem else RuntimeError("CUDA error: out of memory")
+    monkeypatch.setattr(torch, "ones", Mock(side_effect=full))
+    getattr(call, "cache_clear", bool)()
+    for _ in range(2):
+        with pytest.raises(MemoryExhaustedError, match="memory is full .*; end other programs"):
+            call()
 
 
 def one_view(call=rasterize, **changes):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from fields import random_field
-from packed_scenes import KINDS, write_kind
+from packed_scenes import KINDS, scene, write_kind
 
 import sundae_ns as sn
 from sundae_ns.core.covariance import rotation_matrices
@@ -18,18 +18,8 @@ SHIFT = torch.tensor([3.0, -1.0, 0.5], dtype=torch.float64)
 SCALE = 2.5
 
 
-def scene(degree=4, **values):
-    gaussians = random_field(200, degree=degree, features=0)
-    gaussians["scales"] += 2
-    return sn.Scene(Gaussians(gaussians), **values)
-
-
 def moved(whole):
     return sn.transform(whole, TURN, SCALE, SHIFT)
-
-
-def headed(tmp_path):
-    return sn.load(write_kind(tmp_path / "a.sundae", KINDS["residual"]))
 
 
 def survey(east, **values):
@@ -66,8 +56,9 @@ def test_properties_and_arrays_are_counterparts():
 
 def test_moved_cameras_see_the_same_image(tmp_path):
     """Harmonics of degree 4, the head, and thin Gaussians with their blur in pixels too."""
-    cameras = tuple(sn.virtual_cameras(scene(), 3, size=48))
-    for whole in (scene(cameras=cameras, start=cameras[1], up=(0.0, 1.0, 0.0)), headed(tmp_path)):
+    cameras = tuple(sn.virtual_cameras(scene(degree=4), 3, size=48))
+    headed = sn.load(write_kind(tmp_path / "a.sundae", KINDS["residual"]))
+    for whole in (scene(degree=4, cameras=cameras, start=cameras[1], up=(0.0, 1.0, 0.0)), headed):
         after = moved(whole)
         for camera, there in zip((*whole.cameras, whole.start), (*after.cameras, after.start)):
             if camera is not None and there is not None:
@@ -79,8 +70,8 @@ def test_moved_cameras_see_the_same_image(tmp_path):
         assert after.up == (whole.up and pytest.approx((TURN @ torch.tensor(whole.up).double()).tolist()))
     tiny = sn.transform(whole, scale=1e-4)
     torch.testing.assert_close(sn.render(tiny, tiny.cameras[0]).rgb, sn.render(whole, whole.cameras[0]).rgb)
-    same = sn.transform(scene(), QUATERNION * 3, SCALE, SHIFT.tolist())
-    torch.testing.assert_close(same.gaussians["features_rest"], moved(scene()).gaussians["features_rest"])
+    same = sn.transform(scene(degree=4), QUATERNION * 3, SCALE, SHIFT.tolist())
+    torch.testing.assert_close(same.gaussians["features_rest"], moved(scene(degree=4)).gaussians["features_rest"])
 
 
 def test_cameras_of_a_capture_follow_a_run():
@@ -116,8 +107,8 @@ def test_survey_coordinates_are_moved_and_merged_in_the_file(tmp_path):
 
 def test_a_merge_is_both_scenes():
     camera = sn.Camera.look_at((0, -30, 0), (0, 0, 0), width=64, height=32)
-    red = scene(0, cameras=(camera,), background_color="white")
-    blue = sn.transform(scene(2), translation=(6, 0, 0))
+    red = scene(degree=0, cameras=(camera,), background_color="white")
+    blue = sn.transform(scene(degree=2), translation=(6, 0, 0))
     logits = sn.Scene(Gaussians(random_field(7, degree=0), "logits"), cameras=(camera,), up=(0.0, 0.0, 1.0))
     both = sn.merge([red, blue, logits])
     assert (len(both), both.gaussians.sh_degree, both.up, both.background_color) == (407, 2, logits.up, "white")
@@ -129,7 +120,7 @@ def test_a_merge_is_both_scenes():
 
 
 def test_a_head_goes_with_its_features(tmp_path):
-    whole = headed(tmp_path)
+    whole = sn.load(write_kind(tmp_path / "a.sundae", KINDS["residual"]))
     parts = sn.merge([whole[::2], whole[1::2].to("cpu")])
     assert sn.measure(parts, whole, whole.cameras[0]).psnr > 60
     assert parts.head is whole.head is not None
@@ -137,4 +128,4 @@ def test_a_head_goes_with_its_features(tmp_path):
     for odd in (other, dataclasses.replace(whole, head=None)):
         with pytest.raises(sn.SundaeError, match="one head cannot correct scenes of others; give"):
             sn.merge([whole, odd])
-    assert "features" not in sn.merge([dataclasses.replace(whole, head=None), scene(1)]).gaussians
+    assert "features" not in sn.merge([dataclasses.replace(whole, head=None), scene(degree=1)]).gaussians

@@ -7,18 +7,11 @@ from unittest.mock import Mock
 import pytest
 import torch
 from fields import random_field
-from packed_scenes import KINDS, write_kind
+from packed_scenes import KINDS, scene, write_kind
 
 import sundae_ns as sn
 from sundae_ns.core.errors import BackendError, ConfigError, MemoryExhaustedError
-from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.rasterize.gsplat_backend import GsplatBackend
-
-
-def scene(n=200, degree=2):
-    gaussians = random_field(n, degree=degree, features=0)
-    gaussians["scales"] += 2
-    return sn.Scene(Gaussians(gaussians))
 
 
 @cache

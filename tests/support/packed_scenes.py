@@ -194,3 +194,10 @@ def resection(path: Path, name: str, array: Any) -> None:
     header = container.read_header(path)
     meta = {key: value for key, value in header.meta.items() if key != "sections"}
     path.write_bytes(container.encode(meta, {**container.read_sections(path, header), name: array})[0])
+
+
+def scene(n: int = 200, degree: int = 2, **values: Any) -> Scene:
+    """A random field without a head, of Gaussians that cover pixels."""
+    gaussians = random_field(n, degree=degree, features=0)
+    gaussians["scales"] += 2
+    return Scene(Gaussians(gaussians), **values)

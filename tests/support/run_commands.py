@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import zipfile
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import command_line
@@ -26,6 +26,7 @@ STEPS = ["sundae poses", "ns-train", "sundae pack", "sundae compare", "sundae ex
 NASTY = """-a b'c"d$(touch PWNED)`touch PWNED`;touch PWNED&"""
 """A name that a shell or a reader of options would take for something else."""
 NAMES = ["camera poses", "train", "pack", "report", "web page"]
+run = partial(command_line.run, "run")
 
 
 class Commands:
@@ -115,10 +116,6 @@ def packed() -> bytes:
     model = {"sh_degree": 0, "rasterize_mode": "classic", "background_color": "black"}
     scene = PackedScene(from_points(points, points, sh_degree=0), meta={"model": model})
     return pack_bytes(*fit_scene(scene))[0]
-
-
-def run(*words: str) -> int:
-    return command_line.run("run", *words)
 
 
 def refusal(capsys: pytest.CaptureFixture[str], *words: str) -> str:

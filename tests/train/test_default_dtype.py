@@ -88,10 +88,8 @@ def test_the_default_dtype_changes_nothing(name, build):
         torch.manual_seed(0)
         model = build(background_color="black") if name == "growth" else None
         torch.set_default_dtype(dtype)
-        try:
-            results.append([*(MADE[name]() if model is None else growth(model))])
-        finally:
-            torch.set_default_dtype(torch.float32)
+        results.append([*(MADE[name]() if model is None else growth(model))])
+        torch.set_default_dtype(torch.float32)
     for value, other in zip(*results, strict=True):
         assert value.dtype == other.dtype
         assert torch.equal(value.nan_to_num(), other.nan_to_num())

@@ -34,11 +34,6 @@ _ready: set[tuple[Any, ...]] = set()  # loops already called, with the dtypes of
 _noticed: list[Any] = []  # the loop whose compilation was announced: once for each process
 
 
-def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
-    """As :func:`compiled`, but inlined into the calling loop, which keeps lanes in registers."""
-    return compiled(function, forceinline=True, _nrt=False)
-
-
 def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     """Compile at the first call with new types; later processes load the machine code from disk.
 
@@ -58,6 +53,8 @@ def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]
 
 borrowing = partial(compiled, _nrt=False)
 """As :func:`compiled`, for loops that make no arrays: they do not count who uses those that they are given."""
+inlined = partial(borrowing, forceinline=True)
+"""As :data:`borrowing`, for functions that are inlined into the calling loop, which keeps lanes in registers."""
 
 
 def parallel_for(loop: Callable[..., None], count: int, *arguments: Any, min_per_thread: int = 1) -> None:
