@@ -6,6 +6,7 @@ from functools import partial
 
 import cv2
 import numpy as np
+import pillow_heif
 import pytest
 import tifffile
 from icc_profiles import SPACES, judged, profile
@@ -51,8 +52,7 @@ KINDS = {
 @pytest.mark.parametrize("space", SPACES)
 @pytest.mark.parametrize("name", KINDS)
 def test_a_profile_is_converted_as_imagecms_does(tmp_path, name, space):
-    if name == "a.heic" and not reads_heif():
-        pytest.skip("pillow-heif is not installed")
+    assert reads_heif()
     patches().save(tmp_path / name, icc_profile=profile(space), **KINDS[name])
     photo = photo_of(tmp_path / name)
     assert not photo.as_it_is
@@ -65,10 +65,9 @@ def test_a_profile_is_converted_as_imagecms_does(tmp_path, name, space):
 
 
 def test_ten_bits_of_heic(tmp_path):
-    heif = pytest.importorskip("pillow_heif")
-    reads_heif()
+    assert reads_heif()
     deep = (np.asarray(patches(), np.uint16) * 257).tobytes()
-    file = heif.from_bytes(mode="RGB;16", size=(192, 128), data=deep)
+    file = pillow_heif.from_bytes(mode="RGB;16", size=(192, 128), data=deep)
     file.save(tmp_path / "a.heic", quality=100, chroma=444, icc_profile=profile("P3"))
     with opened(tmp_path / "a.heic") as image:
         assert image.info["bit_depth"] == 10

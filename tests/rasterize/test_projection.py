@@ -2,11 +2,10 @@
 
 import pytest
 import torch
+from gsplat.cuda import _torch_impl as gsplat_torch
 from splat_inputs import geometry
 
 from sundae_ns.rasterize.reference import ReferenceBackend, project
-
-gsplat_torch = pytest.importorskip("gsplat.cuda._torch_impl")
 
 WIDTH, HEIGHT = 70, 50
 

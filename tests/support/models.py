@@ -67,10 +67,6 @@ class FakeDatamanager:
 
     mask = None  # Of each view
 
-    @property
-    def cached_train(self):
-        return [_batch() for _ in self.train_indices]
-
     def cameras(self, indices):
         yield from ((_camera(shift=(-0.5, 0.0, 0.5)[index]), _batch()) for index in indices)
 
