@@ -155,10 +155,7 @@ def read_gaussians(path: Path) -> tuple[dict[str, Tensor], bool]:
         return dict(gaussians), (packed.meta.get("source") or {}).get("model_frame") is not False
     if (reason := unread(path)) is not None:
         raise CheckpointError(f"{path} {reason}")
-    if path.is_dir():
-        path, loaded = checkpoint.read_newest(path)
-    else:
-        loaded = checkpoint.read(path)
+    path, loaded = checkpoint.read_newest(path) if path.is_dir() else (path, checkpoint.read(path))
     return dict(usable(checkpoint.gaussians_of(loaded, path), path).gaussians.as_harmonics()), True
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from colmap_models import write_model
+from command_line import said
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from photos import photo
 from PIL import Image, ImageOps
@@ -24,10 +25,6 @@ from sundae_ns.scene.cameras import cameras_of
 from sundae_ns.scene.scene import Scene
 
 SURVEY = np.array([431_250.25, 5_412_330.5, 212.125])  # Coordinates of a place in UTM, metres
-
-
-def said(capsys):
-    return " ".join(capsys.readouterr().out.split())
 
 
 def change_poses(data, edit, change):

@@ -28,6 +28,11 @@ def refusal(capsys: pytest.CaptureFixture[str], *words: object) -> str:
     return line
 
 
+def said(capsys: pytest.CaptureFixture[str]) -> str:
+    """What was printed, in one line, since terminals break lines anywhere."""
+    return " ".join(capsys.readouterr().out.split())
+
+
 @contextmanager
 def served(server: ThreadingHTTPServer) -> Iterator[int]:
     """The port of a server of this machine, which runs."""

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from command_line import said
 from foreign_files import FOREIGN, small_field
 
 from sundae_ns.core.errors import CheckpointError, PackError
@@ -17,10 +18,6 @@ from sundae_ns.train import initialize
 from sundae_ns.train.initialize import FEWEST_POINTS
 
 N = 60  # Gaussians of a model that is built without a count
-
-
-def said(capsys):
-    return " ".join(capsys.readouterr().out.split())
 
 
 def colors_of(model, camera):
