@@ -10,8 +10,6 @@ from collections import Counter
 from functools import cache
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[1]
 PACKAGE = "sundae_ns"
 TABLE = re.findall(r"^\| *(\d+) \| (`[^|]+) \|", (ROOT / "docs" / "architecture.md").read_text(), re.MULTILINE)
@@ -151,8 +149,3 @@ def test_the_detectors_can_fail():
     assert violations("train", imports_of(source)) == {"plugin", "cli"}
     assert out_of_budget({"a": 10, "b": 9, "c": 1}, {"a": 10, "b": 8, "d": 90}).keys() == {"b", "c", "d"}
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == ["a", "b", "c"]
-
-
-@pytest.mark.parametrize("word", ["shards", "budget", "preview"])
-def test_the_model_asks_for_no_kind(word):
-    assert word not in (ROOT / PACKAGE / "plugin" / "model.py").read_text().lower()
