@@ -92,8 +92,10 @@ def test_damaged_values_of_transforms(capture, data, value):
     if value == "gone":
         del holder[key]
     (capture / "transforms.json").write_text(json.dumps(meta))
-    verdict(lambda: load(capture), bytes_of(capture))
-    (capture / "transforms.json").write_text(content)
+    try:
+        verdict(lambda: load(capture), bytes_of(capture))
+    finally:
+        (capture / "transforms.json").write_text(content)
 
 
 NAN = float("nan")
