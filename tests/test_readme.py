@@ -69,23 +69,8 @@ def test_named_tests_exist_and_every_results_file_is_named():
 
 METHOD = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
 NAME = re.compile(r"`(sundae_ns(?:\.\w+)+)`")
-EQUATION = re.compile(r"```math\n(.*?)```\n", re.DOTALL)
 
 
 @pytest.mark.parametrize("name", sorted(set(NAME.findall(METHOD))))
 def test_every_function_of_the_method_exists(name):
     assert callable(pkgutil.resolve_name(name))
-
-
-def test_every_equation_has_its_function_and_is_rendered_by_github():
-    pieces = EQUATION.split(METHOD)
-    equations, texts = pieces[1::2], pieces[2::2]
-    assert len(equations) > 15
-    for equation, text in zip(equations, texts, strict=True):
-        assert NAME.search(re.split(r"^#", text, maxsplit=1, flags=re.MULTILINE)[0]), equation
-        for one, other in (("{", "}"), ("\\left", "\\right"), ("\\begin", "\\end")):
-            assert equation.count(one) == equation.count(other), equation
-    # GitHub takes ```math blocks and single dollars; other ways stay as they are typed.
-    assert "$$" not in METHOD
-    assert "\\[" not in METHOD
-    assert METHOD.count("```math") == len(equations) == METHOD.count("```") / 2

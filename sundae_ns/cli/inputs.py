@@ -196,6 +196,8 @@ def opened(source: Path, wishes: Wishes, details: SceneDetails, *, capture: bool
         check_file(details.preview, reads=[source, details.cameras], overwrite=details.overwrite)
     if is_run(source) and (capture or wishes.remove_floaters is not None or details.data is not None):
         scene, rows = open_run(source, max_cameras=most, data=details.data), None
+    elif details.data is not None:
+        raise ConfigError(f"--data is the capture of a run, and {source} is none; leave it out")
     else:
         scene, rows = load_with_mask(source)
     cameras, speed = chosen_cameras(scene, details.cameras, None)

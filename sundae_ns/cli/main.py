@@ -9,6 +9,7 @@ import io
 import logging
 import os
 import re
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -86,7 +87,7 @@ def _dispatch(words: Sequence[str]) -> int:
         with redirect_stderr(messages):
             chosen = tyro.cli(later, prog=f"sundae {name}", args=options)
     except SystemExit as end:
-        if not end.code:  # it was the help
+        if end.code != 2:  # it was the help, or a signal
             raise
         # Of a box of many lines, those that are not indented further; between its rules are parts.
         rows = " ".join(re.findall(r"(?m)^[│ ] {1,5}(\S.*?)\.? *│?$", messages.getvalue()))
@@ -128,6 +129,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run ``sundae``."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     if arguments is None:
+        for each in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)):  # else no half-written file is removed
+            if signal.getsignal(each) == signal.SIG_DFL:
+                signal.signal(each, lambda number, _: sys.exit(128 + number))
         warnings.simplefilter("ignore")  # of libraries; PYTHONWARNINGS=error would make them errors
         logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it looks for a home
         for name in ("stdout", "stderr"):

@@ -104,11 +104,11 @@ def _interruptible(work: Callable[[], Placed], folder: Path) -> Placed:
             return threads.submit(work).result()
         except (SundaeError, OSError):
             raise
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, SystemExit) as stop:
             cursor = "\x1b[?25h\x1b[2K\r" if sys.stderr.isatty() else ""  # a bar hides it
             message = "" if os.environ.get(STEP) else "sundae: interrupted; the same command continues here\n"
             print(f"{cursor}{message}", end="", file=sys.stderr, flush=True)
-            os._exit(130)
+            os._exit(getattr(stop, "code", 130))
         except Exception as error:  # COLMAP raises many kinds
             remedy = f"remove {shlex.quote(word(folder))} and start again, or report it"
             raise DataError(f"COLMAP failed ({one_line(error)}); {remedy}") from error

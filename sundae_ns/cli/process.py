@@ -38,9 +38,9 @@ def run_command(words: Sequence[str], log: Path | None = None) -> int:
 
         def show(line: str) -> None:
             line = line.rstrip()
-            if (percent := percent_of(line)) is not None:
-                bar.update(task, completed=percent, description=" ".join(["Training", *line.split("  ")[-2:]]))
-            if _MESSAGES.match(line) or (percent is not None and bar.disable):
+            if share := re.match(r"\s*\d+ \(([\d.]+)%\)", line):
+                bar.update(task, completed=float(share[1]), description=" ".join(["Training", *line.split("  ")[-2:]]))
+            if _MESSAGES.match(line) or (share and bar.disable):
                 print(line, flush=True)
 
         code, end = run_logged(words, log, show)
@@ -95,8 +95,3 @@ def run_logged(words: Sequence[str], log: Path | None = None, on_line: Callable[
                 signal.signal(number, handler)
     code = 128 + received[0] if received else code
     return code if code >= 0 else 128 - code, "\n".join(last)
-
-
-def percent_of(line: str) -> float | None:
-    """Progress in per cent from a line of ns-train's output; None if the line has none."""
-    return float(match[1]) if (match := re.match(r"^\s*\d+ \(([\d.]+)%\)", line)) else None

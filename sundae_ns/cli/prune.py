@@ -61,7 +61,7 @@ def prune(
             head if cameras that no step sees show that it pays. Ctrl-C saves; the same command resumes.
     """
     wishes.check_wishes(target_drop=target_drop)
-    check_least(target_drop=(target_drop, 0.001))
+    check_least(target_drop=(target_drop, 0.001), num_cameras=(advanced.num_cameras, 1))
     check_exclusive(distill=distill or None, target_drop=target_drop)
     with_head = check_suffix(out, SUFFIXES) in (".sundae", ".html")
     if advanced.steps is not None and not distill:

@@ -23,7 +23,7 @@ from sundae_ns.cli.train import TrainOptions, pack_run
 from sundae_ns.core.errors import STOPPED, ConfigError, DataError, StorageError, SundaeError
 from sundae_ns.core.files import put_aside, write_text
 from sundae_ns.data.capture_files import placed_in
-from sundae_ns.data.layouts import is_model, is_posed, no_transforms, posed_layout
+from sundae_ns.data.layouts import CAMERA_FILES, is_model, is_posed, no_transforms, posed_layout
 from sundae_ns.io.config_file import schedule_length
 from sundae_ns.io.pack.config import tuned_steps
 from sundae_ns.io.pack.container import read_header, read_sections
@@ -77,9 +77,9 @@ class Project:
 
     def check(self) -> None:
         """Raise an error for photos that cannot be used, and for options that contradict each other."""
-        method = self.train.method
-        if not self.posed and ((self.photos / "sparse").is_dir() or is_model(self.photos)):
-            raise no_transforms(self.photos)  # says how to use a capture in another layout
+        method, photos = self.train.method, self.photos
+        if not self.posed and (photos.suffix in CAMERA_FILES or (photos / "sparse").is_dir() or is_model(photos)):
+            raise no_transforms(photos)  # says how to use a capture in another layout
         self.train.check(self.photos)
         if self.posed and self.poses.masks is not None:
             self.train.words(self.photos, self.out, masks=self.poses.masks)  # refuses wrong ones

@@ -64,7 +64,7 @@ class TrainOptions(Wishes):
             "--pipeline.model.pruning.seed": self.advanced.seed,
             "--max-num-iterations": self.steps,
         }
-        if tunes and not any(_value_of(option, more) for option in LENGTHS):
+        if tunes and not any(text.startswith(LENGTHS) for text in more):
             given["--finetune-steps"] = FINETUNE_STEPS
         words += [text for option, value in given.items() if value is not None for text in (option, str(value))]
         layout = None if any(map(_is_parser, more)) else posed_layout(capture, masks)
@@ -108,7 +108,9 @@ def train(
         raise no_transforms(capture)
     check_folder(out, reads=[], overwrite=True)
     old, step, length = unfinished_run(out, options.method, capture) or (None, 0, 0)
-    more, given = list(further), _value_of("--timestamp", further)
+    more = list(further)
+    split = [piece for text in further for piece in text.split("=", 1)]
+    given = next((value for name, value in pairwise(split) if name == "--timestamp"), None)
     name = given or new_name()
     if resume:
         if old is None:
@@ -139,12 +141,6 @@ def pack_run(run: Path, out: Path, *more: str, finetune: bool) -> int:
             return code
         print(f"# the fine-tune ended with {code}; packing without it:")
     return run_command(words)
-
-
-def _value_of(option: str, words: Sequence[str]) -> str | None:
-    """The value of an option of ns-train, after a space or ``=``; None without it."""
-    split = [piece for text in words for piece in (text.split("=", 1) if text.startswith("--") else [text])]
-    return next((value for name, value in pairwise(split) if name == option), None)
 
 
 def _is_parser(word: str) -> bool:

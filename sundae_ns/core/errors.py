@@ -102,6 +102,8 @@ def reading(
         with suppress(OSError, ValueError), regular(path).open("rb") as file:
             first = file.read(32).lower()
             what = next((other for begin, other in _STAND_INS.items() if first.startswith(begin)), what)
+        if isinstance(error, MemoryError) or "DefaultCPUAllocator" in reason:
+            raise MemoryExhaustedError(f"the memory is full with {path} ({reason}); end other programs") from error
         raise failure(f"{path} {what}") from error
 
 

@@ -18,6 +18,8 @@ _MODELS = "sparse colmap/sparse dense/sparse dense distorted/sparse sparse/align
 _IMAGES = ("images", "Images", "input", "photos", "image", "rgb", "frames", "imgs", "color", "undistorted")
 _SUFFIXES = {".png", ".jpg", ".jpeg"}
 _BLENDER = "transforms_train.json"
+# Files with cameras of Metashape and RealityScan, which both write COLMAP's format too.
+CAMERA_FILES = dict.fromkeys((".xml", ".csv"), "export its cameras as COLMAP, and give their folder, with the images")
 
 
 class Layout(NamedTuple):
@@ -117,7 +119,8 @@ def _blender_layout(data: Path) -> Layout:
 def no_transforms(data: Path) -> DataError:
     """The error for a path without a ``transforms.json``, with advice that fits its contents."""
     if data.is_file():
-        return DataError(f"{data} is a file, not a capture; sundae poses makes a capture of a video")
+        advice = CAMERA_FILES.get(data.suffix.lower(), "sundae poses makes a capture of a video")
+        return DataError(f"{data} is a file, not a capture; {advice}")
     advice = f"{data} has no transforms.json"
     if (data / _BLENDER).is_file():
         advice += f"; it is in Blender's layout ({_BLENDER}): add `blender-data` to ns-train"

@@ -63,8 +63,7 @@ class Configuration:
     def mean(self, metric: str) -> float | None:
         """Mean of a metric over the views; None unless every view has it."""
         values = [getattr(view, metric) for view in self.views]
-        known = [value for value in values if value is not None and not math.isnan(value)]
-        return fmean(known) if known and len(known) == len(values) else None
+        return None if not values or any(value is None or math.isnan(value) for value in values) else fmean(values)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """What commands may write, and what they may read: nothing is lost, nothing hangs, a full disk is one line."""
 
 import os
+import signal
 import subprocess
 import sys
 from functools import partial
@@ -149,3 +150,11 @@ def test_a_closed_stdout_is_no_error(words):
     with installed(words, "", preexec_fn=partial(os.close, 1)) as process:
         assert process.stderr.read() == b""
     assert process.returncode == 0
+
+
+@pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_leaves_no_half_of_a_file(here, sent):
+    killed = f"import os, time; os.fsync = lambda _: (os.kill(os.getpid(), {sent:d}), time.sleep(600))"
+    words = [sys.executable, "-c", f"{killed}; import sundae_ns.cli as it; it.main()", *"export a.ply -o b.spz".split()]
+    done = subprocess.run(words, preexec_fn=partial(signal.signal, sent, signal.SIG_DFL), check=False)
+    assert (done.returncode, sorted(path.name for path in here.iterdir())) == (128 + sent, ["a.ply", "a.sundae"])

@@ -33,11 +33,12 @@ REFUSALS = {
     "prune in.ply -o a.ply --target-drop 0": "target-drop is 0.0; give at least 0.001",
     "prune in.ply -o a.ply --target-drop 1 --num-cameras 1": "a target needs two",
     "prune in.ply -o a.ply --max-mb inf": "max-mb is inf; give less, at least 0.001",
+    "prune in.ply -o a.ply --num-cameras 0": "num-cameras is 0; give at least 1",
+    "prune in.ply -o a.ply --data photos": "--data is the capture of a run, and in.ply is none; leave it out",
     "prune in.ply -o a.ply --num-cameras 10001": "n is 10001; give at most 10,000",
     "prune in.ply -o a.ply --seed 99999999999999999999": "seed is 99999999999999999999; give at most 9,223,372,",
     "prune empty.ply -o a.ply": "empty.ply has 0 Gaussians, and none is finite; export it again",
     "prune in.ply -o /proc/a.ply": "cannot write to /proc (",
-    "prune a.ksplat -o a.ply": "a.ksplat is not a complete .ksplat (",
     "pack page.html -o a.sundae": "page.html is not a page with its scene (",
     "prune trained -o a.ply": "trained is a folder of 3DGS; give trained/point_cloud/iteration_30000/point",
     "prune in.ply -o b.ply --distill": "b.ply cannot hold a head; name it .sundae, or leave",
@@ -52,10 +53,7 @@ REFUSALS = {
     "export in.ply -o a.sog --upright": "not in nerfstudio's coordinates",
     "export in.sundae -o a.html --upright": "leave out --upright",
     "export in.bin -o a.ply": "in.bin is not a complete .spz (",
-    "export nothing.sundae -o a.ply": "nothing.sundae cannot be read",
-    "export a.glb -o a.ply": "a.glb is not a complete .glb with Gaussians",
     "pack in.sundae -o a.sundae --finetune 9": "in.sundae is a packed scene without photos; leave out",
-    "pack in.ply -o a.sundae --finetune 9": "in.ply is a .ply file without photos; leave out",
     "pack in.ply -o a.sundae --seed -5": "seed is -5; give at least 0",
     "pack in.ply -o a.sundae --start-view 0": "there is no camera 0 in the scene; give a camera file",
     "pack in.ply -o a.sundae --target-drop 1": "leave out --target-drop, or give a run",
@@ -75,7 +73,6 @@ REFUSALS = {
     "compare in.ply -o . --overwrite": "holds what the command reads",
     "view damaged.json": "damaged.json is no run; give a run, its config.yml, or a .sundae",
     "export trained/point_cloud -o a.html": "trained/point_cloud is no run; give a run",
-    "view a.splat": "a.splat is not a complete .splat (",
     "render a.pth -o a.png": "a.pth is a checkpoint of another trainer; give its .ply",
     "render in.sundae -o a.png": "there are 2 cameras; give --view 0 to 1, or write an .mp4",
     "render in.sundae -o a.gif --view 0": "a.gif has no supported suffix; name it .png",
@@ -85,12 +82,13 @@ REFUSALS = {
     "render in.sundae -o a.mp4 --fps nan": "--fps is of a video",
     "render in.sundae -o a.png --view 0 --preview ./a.png --remove-floaters": "a.png is the image and its --preview",
     "render in.sundae -o a.png --cameras in.ply": "); give a transforms.json, the folder of a COLMAP model, or",
-    "render in.sundae -o a.png --cameras none.json": "none.json",
     "train scene --seed -1": "seed is -1; give at least 0",
     "train scene --count 9 --crop 0 0 0 1 1 1": "reaches --count before --crop cuts; give both to sundae pack",
     "train scene --method splatfacto": "splatfacto is no method of sundae; use one of sundae, ",
     "train empty": "empty has no transforms.json; ",
     "train text.mp4": "text.mp4 is a file, not a capture; sundae poses makes a capture of a video",
+    "train a.xml": "a.xml is a file, not a capture; export its cameras as COLMAP, and give their folder, with the",
+    "run a.xml -o out": "a.xml is a file, not a capture; export its cameras as COLMAP",
     "train scene photos": "photos is no option; options of ns-train follow a --",
     "train scene --resume --steps 5": "leave out --steps or --resume",
     "train scene --resume": "outputs has no unfinished run of sundae on scene; leave out --resume",
@@ -101,7 +99,6 @@ REFUSALS = {
     "poses photos/0.JPG -o out": "give the folder of photos",
     "poses photos -o photos/capture": "photos/capture lies in photos",
     "poses photos -o out --frames 2": "frames is 2; give at least 3",
-    "poses photos -o out --masks gone": "photos/0.JPG has no mask 0.png in gone; add it",
     "poses walk.mp4 -o out --masks empty": "a video has no masks",
     "run gone -o out": "gone does not exist; check the path",
     "run model -o out": "cameras.bin is not a complete cameras.bin of COLMAP",
@@ -131,12 +128,10 @@ def inputs(tmp_path_factory):
     cameras = tuple(sn.Camera.look_at((x, -2, 0.5), (0.5, 0.5, 0.5), width=41, height=31) for x in (0.0, 1.0))
     sn.save(scene, folder / "in.ply")
     sn.save(dataclasses.replace(scene, cameras=cameras), folder / "in.sundae")
-    header, values = (folder / "in.ply").read_bytes().split(b"end_header\n")
-    for name, count in (("none.ply", 5), ("empty.ply", 0)):
-        nan = b"\xff" * (len(values) // 200 * count)
-        (folder / name).write_bytes(header.replace(b"vertex 200", b"vertex %d" % count) + b"end_header\n" + nan)
+    header, _ = (folder / "in.ply").read_bytes().split(b"end_header\n")
+    (folder / "empty.ply").write_bytes(header.replace(b"vertex 200", b"vertex 0") + b"end_header\n")
     contents = {"in.bin": b"\x1f\x8b\xff", "damaged.json": b"{"}
-    contents |= dict.fromkeys("a.ksplat a.lcc a.glb a.pth a.splat page.html a.ssproj a.usdz".split(), bytes(33))
+    contents |= dict.fromkeys("a.lcc a.pth page.html a.ssproj a.usdz a.xml".split(), bytes(33))
     contents |= {"text.mp4": b"not a video", "trained/point_cloud/iteration_30000/point_cloud.ply": b""}
     contents["trained/point_cloud/iteration_7000/point_cloud.ply"] = b""  # written later
     empty = "scene/transforms.json", "model/sparse/0/cameras.bin", "blender/transforms_train.json", "used/thesis.txt"

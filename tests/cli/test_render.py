@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import json
+from functools import partial
 
 import av
 import command_line
@@ -15,10 +16,7 @@ import sundae_ns as sn
 
 VIEWS = [sn.Camera.look_at((x, -2.0, 0.5), (0.5, 0.5, 0.5), fov=60.0, width=41, height=31) for x in (0.5, 1.3)]
 POSE = [*VIEWS[0].pose.tolist(), [0.0, 0.0, 0.0, 1.0]]
-
-
-def run(*arguments):
-    return command_line.run("render", *arguments)
+run = partial(command_line.run, "render")
 
 
 def write_json(path, **content):

@@ -13,7 +13,7 @@ import torch
 from foreign_files import small_field
 from PIL import Image
 
-from sundae_ns.core.errors import DataError, PackError, StorageError, reading, regular, writing
+from sundae_ns.core.errors import DataError, MemoryExhaustedError, PackError, StorageError, reading, regular, writing
 from sundae_ns.core.files import locked, put_aside, replacing, write_files, write_image, write_text
 from sundae_ns.io.ply import write_ply
 
@@ -134,6 +134,8 @@ def test_only_regular_files_are_read(tmp_path):
         (KeyError("means\n twice"), PackError, r"a\.x is not a whole x \('means\\n twice'\); get it again"),
         (ValueError(), PackError, r"a\.x is not a whole x \(ValueError\); get it again"),
         (DataError("one of ours; mend it"), DataError, "one of ours; mend it"),
+        (MemoryError("9 GB"), MemoryExhaustedError, r"the memory is full with a\.x \(9 GB\); end other programs"),
+        (RuntimeError("DefaultCPUAllocator: a"), MemoryExhaustedError, "the memory is full with .*"),
     ],
 )
 def test_errors_of_reading_name_the_file(raised, kind, message):
