@@ -12,7 +12,10 @@ type Answer = { scene: Scene } | { error: string } | { share: number };
 export function answer(): void {
   self.onmessage = async ({ data }: MessageEvent<Uint8Array<ArrayBuffer>>) => {
     try {
-      self.postMessage({ scene: await readScene(data, (share) => self.postMessage({ share })) });
+      const scene = await readScene(data, (share) => self.postMessage({ share }));
+      // Arrays are moved, not copied: a phone may lack the memory for two scenes.
+      const buffers = Object.values(scene.field).flatMap((value) => (typeof value === "number" ? [] : [value.buffer]));
+      self.postMessage({ scene }, { transfer: [...new Set(buffers)] });
     } catch (error) {
       self.postMessage({
         error: error instanceof PackError ? error.message : `The scene cannot be decoded (${error}).`,
@@ -43,7 +46,7 @@ export function decode(
     };
     worker.onerror = (event) => fail(`The scene cannot be decoded (${event.message}).`);
   });
-  worker.postMessage(file);
+  worker.postMessage(file, [file.buffer]);
   return result.finally(() => {
     worker.terminate();
     URL.revokeObjectURL(address);

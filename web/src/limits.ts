@@ -1,4 +1,4 @@
-// The bound of one view, the twin of sundae_ns/rasterization/limits.py, which says how it was chosen: a small file can
+// The bound of one view, the twin of sundae_ns/rasterize/types.py, which says how it was chosen: a small file can
 // describe a view that takes minutes and all of the memory.
 
 /** Most pairs of a tile and a primitive in a view that is drawn: 8,192 in each tile on average, 4 for each primitive. */

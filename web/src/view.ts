@@ -45,7 +45,7 @@ const FADE: [number, number] = [4, 2];
 const MAX_PIXELS = 2 ** 24;
 const MARGIN = 1.25;
 
-/** The scale and the share of the correction of a view; the twin of sundae_ns/compensation/scale.py. */
+/** The scale and the share of the correction of a view; the twin of sundae_ns/scene/render.py. */
 export function scalePlan(view: View, trained: [number, number] | null): ScalePlan {
   if (trained === null) return { zoom: 1, weight: 1 };
   const focal = (view.fx + view.fy) / 2;

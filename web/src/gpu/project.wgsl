@@ -1,4 +1,4 @@
-// Projects the primitives and evaluates their colours; the twin of sundae_ns/rasterization/projection.py.
+// Projects the primitives and evaluates their colours; the twin of sundae_ns/rasterize/reference.py.
 
 struct Primitive {
   mean: vec3f,

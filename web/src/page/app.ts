@@ -62,7 +62,11 @@ async function sceneFile(
   const chunks: Uint8Array<ArrayBuffer>[] = [];
   let loaded = 0;
   const reader = answer.body!.getReader();
-  for (let part = await reader.read(); !part.done; part = await reader.read()) {
+  const next = () =>
+    reader.read().catch(() => {
+      throw new PackError(`${source} was cut off while it was loaded; load the page again.`);
+    });
+  for (let part = await next(); !part.done; part = await next()) {
     chunks.push(part.value);
     loaded += part.value.length;
     if (length) onProgress(Math.min(loaded / length, 1));
@@ -195,9 +199,11 @@ function follow(
       write(page.stats, parts.filter(Boolean).join(" · "));
       Object.assign(handle, { times, drawn: stage.drawn });
     }
+    stage.crowded = crowded;
+    const most = Math.max(...stages.map((each) => each.crowded));
     const notice = stages.map((each) => each.notice).find(Boolean) ?? "";
     Object.assign(handle, { message: notice, frames: handle.frames + 1 });
-    const said = crowded ? tooMany(crowded) : notice;
+    const said = most ? tooMany(most) : notice;
     // A message that was closed stays closed.
     if (said !== page.said.textContent) {
       page.said.textContent = said;

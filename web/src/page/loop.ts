@@ -31,6 +31,8 @@ export class Loop {
   /** The share of the head in the image on show. */
   private share = 0;
   private fadingSince = 0;
+  /** Pixels of the screen in one of the page; a window that moves to another screen may keep its size. */
+  private ratio = devicePixelRatio;
   private readonly pace = new Pace();
   /** One at a time: frames and other images share the buffers of the drawer. */
   private busy: Promise<unknown> = Promise.resolve();
@@ -64,7 +66,7 @@ export class Loop {
   async run(fail: (error: unknown) => void): Promise<void> {
     await this.draw(true);
     const next = (now: number): void => {
-      if (this.navigation.move(now)) this.moved();
+      if (this.navigation.move(now) || this.ratio !== devicePixelRatio) this.moved();
       this.busy = this.busy.then(() => this.step());
       this.busy.then(() => requestAnimationFrame(next), fail);
     };
@@ -81,6 +83,7 @@ export class Loop {
 
   private async draw(moving: boolean): Promise<void> {
     this.changed = false;
+    this.ratio = devicePixelRatio;
     const { scale, head } = this.wanted();
     const shown = moving ? this.pace.share : 1;
     const corrected = head && this.stage.hasHead;
@@ -107,7 +110,7 @@ export class Loop {
 
   /** Width and height of the page in pixels of the screen. */
   private get size(): [number, number] {
-    return [this.place.clientWidth * devicePixelRatio, this.place.clientHeight * devicePixelRatio];
+    return [this.place.clientWidth * this.ratio, this.place.clientHeight * this.ratio];
   }
 
   /** The view of the canvas, which gets its size. */

@@ -259,7 +259,6 @@ export class Navigation {
     // Arrows also move the slider.
     if (event.target instanceof HTMLInputElement && event.target.type === "range") return;
     this.pressed.add(event.code);
-    this.lastMove = performance.now();
     this.leave();
     this.onChange();
   }

@@ -20,6 +20,8 @@ export class Stage {
   /** Why the current drawer cannot draw any more; null while it can. */
   private lost: string | null = null;
   private contexts = 0;
+  /** Gaussians over each pixel of the last view if they are too many; 0 for any other view. */
+  crowded = 0;
 
   /**
    * @param place - takes the canvas, and keeps mouse and touch when the canvas is replaced
@@ -101,7 +103,10 @@ export class Stage {
       const drawer = this.drawer!;
       try {
         const result = await work(drawer);
-        if (this.lost === null) return result;
+        if (this.lost !== null) continue;
+        // What has drawn once draws again: only contexts that are lost before their first image are counted.
+        this.contexts = 0;
+        return result;
       } catch (error) {
         if (error instanceof PackError) throw error;
         this.lost ??= this.drawn === "webgpu" ? `WebGPU failed (${error})` : "WebGL2 failed";

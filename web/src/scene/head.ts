@@ -1,4 +1,4 @@
-// The compensation head of a scene: its kind, and its tensors; see sundae_ns/compensation.
+// The compensation head of a scene: its kind, and its tensors; see sundae_ns/head.
 
 import { checkRatio } from "./container";
 import { levels, predecessors } from "./entropy";

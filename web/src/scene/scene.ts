@@ -10,7 +10,7 @@ import { reachOf } from "./size";
 
 export type Floats = Float32Array<ArrayBuffer>;
 
-/** The parameters of N primitives, as sundae_ns/gaussians/parameters.py names them. */
+/** The parameters of N primitives, as sundae_ns/core/gaussians.py names them. */
 export type Field = {
   count: number;
   means: Floats;
