@@ -73,7 +73,7 @@ def compare(
         raise ConfigError(f"--formats compares one scene with itself; leave out {scenes[1]}, or --formats")
     first = None if photos else load(scenes[0]).to(fastest_device())
     command = shlex.join(["sundae", *typed])
-    repeats = repeats if repeats is not None else 5 * photos
+    repeats = (5 if photos else 0) if repeats is None else repeats
     lpips = Lpips(lpips_net) if photos and lpips_weights(lpips_net)[1].is_file() else None
     unmeasured = f"LPIPS: the weights of its net ({lpips_net}) are missing; sundae doctor says where to put them."
     notes = [unmeasured] if photos and lpips is None else []

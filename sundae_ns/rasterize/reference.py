@@ -119,8 +119,9 @@ def _limit_slope(slope: Tensor, focal: Tensor, centre: Tensor, size: int) -> Ten
 def blended_values(inputs: Inputs, projection: Projection) -> tuple[Tensor, Tensor]:
     """Opacities ``[N]`` and channels ``[N, C]`` to blend: compensated if antialiased, with camera z if requested."""
     opacities = inputs.opacities * projection.compensations if inputs.antialiased else inputs.opacities
-    colors = inputs.colors
-    return opacities, torch.cat([colors, projection.depths[:, None]], dim=-1) if inputs.render_depth else colors
+    if not inputs.render_depth:
+        return opacities, inputs.colors
+    return opacities, torch.cat([inputs.colors, projection.depths[:, None]], dim=-1)
 
 
 # ------------------------------------------------------------------------------------------------------------ blending
