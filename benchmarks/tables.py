@@ -169,24 +169,28 @@ def stock_in(cell: Callable[[dict[str, float]], Any]) -> dict[str, dict[str, Any
 def equal_quality() -> list[str]:
     """Bytes of our smallest fine-tuned packs as a share of stock's .sog by splat-transform, at its PSNR and its SSIM.
 
-    Between measured fixed shares that enclose its quality, the bytes lie on a line, in their logarithm.
+    Packs of the default, and of a fixed share, are means of their seeds. Between measured fixed shares that enclose
+    its quality, the bytes lie on a line, in their logarithm.
     """
-    packs: dict[str, list[dict[str, float]]] = {}
+    seeds: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for row in lines_of("curve.csv"):
         if row["tuned_bytes"]:
-            fixed = row["method"] == "sundae" and row["chosen"] == "no"
-            cells = {name: float(row[f"tuned_{name}"]) for name in ("bytes", "psnr", "ssim")}
-            packs.setdefault(row["capture"], []).append({**cells, "fixed": fixed})
+            key = (row["capture"], row["method"], "" if row["chosen"] == "yes" else row["share"])
+            seeds.setdefault(key, []).append(row)
+    packs: dict[str, list[dict[str, float]]] = {}
+    for (capture, method, share), rows in seeds.items():
+        cells = {name: mean(rows, f"tuned_{name}") for name in ("bytes", "psnr", "ssim")}
+        packs.setdefault(capture, []).append({**cells, "fixed": method == "sundae" and share != ""})
     for line in lines_of("pack.jsonl"):
         if line.get("variant") == "sundae-fast" and line["finetune_steps"]:
             cells = {"bytes": line["bytes"], "psnr": line["psnr_packed"], "ssim": line["ssim_packed"]}
             packs[line["run"]].append({**cells, "fixed": False})
     theirs = {capture: kinds[".sog theirs"] for capture, kinds in stock_in(dict).items() if ".sog theirs" in kinds}
-    rows = []
+    lines = []
     for name in ("psnr", "ssim"):
         shares = [_least_bytes(packs[capture], name, sog[name]) / sog["bytes"] for capture, sog in theirs.items()]
-        rows.append([f"at its {name.upper()}", *(f"1/{1 / share:.0f}" for share in [*shares, fmean(shares)])])
-    return table([".sundae / .sog", *theirs, "mean"], rows, words=1)
+        lines.append([f"at its {name.upper()}", *(f"1/{1 / share:.0f}" for share in [*shares, fmean(shares)])])
+    return table([".sundae / .sog", *theirs, "mean"], lines, words=1)
 
 
 def _least_bytes(packs: Sequence[dict[str, float]], metric: str, aim: float) -> float:

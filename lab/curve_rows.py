@@ -10,6 +10,7 @@ from pathlib import Path
 
 RESULTS = Path("benchmarks/results")
 COMMIT = "57509540"
+SHORT = "keep_ratio psnr ssim psnr_base ssim_base psnr_fitted peak_vram_mib ms_frame ms_splat ms_head train_s prune_s".split()
 folder = Path(sys.argv[1])
 
 
@@ -52,12 +53,15 @@ for path in sorted(folder.glob("quality-*/done/*.json")):
     result = json.loads(path.read_text())
     if "warm-up" not in path.name and result.get("packed"):
         curve.append(curve_row(result, flat(result), False))
+for path in sorted(folder.glob("quality-*/results.csv")):
+    for row in csv.DictReader(path.open()):
+        if row["variant"] == "sundae" and row["keep_ratio"] != "1.0":
+            runs.append({name: short(value) if name in SHORT else value for name, value in row.items()})
 for suite in sorted(folder.glob("suite-*")) + sorted(folder.glob("splatfacto-*")) + sorted(folder.glob("mcmc-*")):
     if not (suite / "results.csv").exists():
         continue
     for row in csv.DictReader((suite / "results.csv").open()):
-        for name in ("keep_ratio", "psnr", "ssim", "psnr_base", "ssim_base", "psnr_fitted", "peak_vram_mib", "ms_frame", "ms_splat", "ms_head", "train_s", "prune_s"):
-            row[name] = short(row[name])
+        row |= {name: short(row[name]) for name in SHORT}
         row["keep_ratio"] = {"splatfacto": "1.0", "mcmc": "0.1"}.get(row["variant"], row["keep_ratio"])
         runs.append(row)
     for line in (suite / "results.jsonl").read_text().splitlines():
