@@ -77,9 +77,9 @@ class Project:
 
     def check(self) -> None:
         """Raise an error for photos that cannot be used, and for options that contradict each other."""
-        method, photos = self.train.method, self.photos
-        if not self.posed and (photos.suffix in CAMERA_FILES or (photos / "sparse").is_dir() or is_model(photos)):
-            raise no_transforms(photos)  # says how to use a capture in another layout
+        method, path = self.train.method, self.photos
+        if not self.posed and (path.suffix.lower() in CAMERA_FILES or (path / "sparse").is_dir() or is_model(path)):
+            raise no_transforms(path)  # says how to use a capture in another layout
         self.train.check(self.photos)
         if self.posed and self.poses.masks is not None:
             self.train.words(self.photos, self.out, masks=self.poses.masks)  # refuses wrong ones

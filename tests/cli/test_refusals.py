@@ -88,7 +88,7 @@ REFUSALS = {
     "train empty": "empty has no transforms.json; ",
     "train text.mp4": "text.mp4 is a file, not a capture; sundae poses makes a capture of a video",
     "train a.xml": "a.xml is a file, not a capture; export its cameras as COLMAP, and give their folder, with the",
-    "run a.xml -o out": "a.xml is a file, not a capture; export its cameras as COLMAP",
+    "run a.XML -o out": "a.XML is a file, not a capture; export its cameras as COLMAP",
     "train scene photos": "photos is no option; options of ns-train follow a --",
     "train scene --resume --steps 5": "leave out --steps or --resume",
     "train scene --resume": "outputs has no unfinished run of sundae on scene; leave out --resume",
@@ -131,7 +131,7 @@ def inputs(tmp_path_factory):
     header, _ = (folder / "in.ply").read_bytes().split(b"end_header\n")
     (folder / "empty.ply").write_bytes(header.replace(b"vertex 200", b"vertex 0") + b"end_header\n")
     contents = {"in.bin": b"\x1f\x8b\xff", "damaged.json": b"{"}
-    contents |= dict.fromkeys("a.lcc a.pth page.html a.ssproj a.usdz a.xml".split(), bytes(33))
+    contents |= dict.fromkeys("a.lcc a.pth page.html a.ssproj a.usdz a.xml a.XML".split(), bytes(33))
     contents |= {"text.mp4": b"not a video", "trained/point_cloud/iteration_30000/point_cloud.ply": b""}
     contents["trained/point_cloud/iteration_7000/point_cloud.ply"] = b""  # written later
     empty = "scene/transforms.json", "model/sparse/0/cameras.bin", "blender/transforms_train.json", "used/thesis.txt"
