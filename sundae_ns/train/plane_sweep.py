@@ -181,19 +181,21 @@ def _to_world(photo: _Reduced, points: Tensor) -> Tensor:
 def _neighbors(photos: Sequence[_Reduced], sparse: Tensor) -> list[tuple[list[int], list[int]]]:
     """For each view those that are compared with it, and those that confirm its depths; the best come first.
 
-    They see most of its sparse points, from directions that differ by some degrees.
+    They see most of its sparse points, from directions that differ by some degrees; views of one place tell no depths.
     """
     if len(photos) < 2 or not len(sparse):
         return [([], []) for _ in photos]
     visible = torch.stack([_in_view(photo.camera, *_project(photo.camera, sparse)) for photo in photos])
     directions = torch.stack([normalize(sparse - photo.pose[:3, 3], dim=-1) for photo in photos])
     neighbors = []
-    for i in range(len(photos)):
+    for i, photo in enumerate(photos):
+        both = visible & visible[i]
         angles = torch.rad2deg((directions * directions[i]).sum(dim=-1).clamp(-1, 1).acos())
-        # Near directions tell little about depths; from far ones places look different.
-        shared = (angles / (angles + 4) * torch.exp(-((angles / 36) ** 2)) * (visible & visible[i])).sum(dim=1)
-        shared[i] = -1
-        order = torch.argsort(shared, descending=True, stable=True)[: len(photos) - 1].tolist()
+        # Near directions tell little about depths, those within a pixel nothing; from far ones places look different.
+        shared = (angles / (angles + 4) * torch.exp(-((angles / 36) ** 2)) * both).sum(dim=1)
+        parallax = photo.camera.focal * torch.deg2rad(angles.masked_fill(~both, torch.nan).nanmedian(dim=1).values)
+        shared[parallax < LARGEST_SHIFT] = shared[i] = -1
+        order = torch.argsort(shared, descending=True, stable=True)[: int((shared >= 0).sum())].tolist()
         neighbors.append(([j for j in order[:NEIGHBORS] if shared[j] > 0], order[:CONFIRMING]))
     return neighbors
 

@@ -180,12 +180,8 @@ def fake(monkeypatch):
     monkeypatch.setattr(FakeSweep, "most", FOUND)
 
 
-def few(build, **options):
-    return build(**{"dense_start_views": 24, **options})
-
-
 def test_the_field_starts_from_both_clouds(build, training_of, points, capsys):
-    model = few(build, sh_degree=1)
+    model = build(dense_start_views=24, sh_degree=1)
     alone = model.scales.detach().clone()
     training = training_of(model)
     assert model.num_points == 60 + FOUND
@@ -201,7 +197,7 @@ def test_the_field_starts_from_both_clouds(build, training_of, points, capsys):
     assert training.live()
     training.step(0)
     assert training.live()
-    saved, resumed = deepcopy(model.state_dict()), few(build)  # which goes on with its own field
+    saved, resumed = deepcopy(model.state_dict()), build(dense_start_views=24)  # which goes on with its own field
     resumed.load_state_dict(saved)
     training_of(resumed)
     assert resumed.num_points == 60 + FOUND
@@ -222,7 +218,7 @@ def test_the_field_starts_from_both_clouds(build, training_of, points, capsys):
 def test_other_fields_stay_as_they_are(build, training_of, monkeypatch, options, filled, most):
     monkeypatch.setattr(initialize, "MOST_ON_CPU", most)
     monkeypatch.setitem(initialize.FILLED, "cpu", filled)
-    model = few(build, **options)
+    model = build(**{"dense_start_views": 24, **options})
     before = model.means.detach().clone()
     training_of(model)
     assert torch.equal(before, model.means)
@@ -232,7 +228,7 @@ def test_more_points_than_wanted_are_thinned_evenly(build, training_of, monkeypa
     monkeypatch.setattr(FakeSweep, "most", 900)
     monkeypatch.setattr(initialize, "MOST_ON_CPU", 3)
     monkeypatch.setitem(initialize.FILLED, "cpu", 60 + 90)
-    model = few(build)
+    model = build(dense_start_views=24)
     training_of(model)
     added = model.means[60:, 0].detach()
     assert len(added) == 90
