@@ -70,16 +70,15 @@ def build(
     )
     densification = Densification(strategy)
     densification.initialize(state)
-    prunes: list[Callback] = [ScheduledPruning(pruning, evaluate=options.evaluate_prune)]
-    if pruning.decides or options.head.mode == "auto":
-        begins_at = int(max(state.head_starts_at, pruning.settled_at, state.densify_until))
-        trials = Trials(options, state, densification, begins_at)
-        prunes = [trials, *prunes, AfterPrune(trials)]
-    train_callbacks = [
+    begins_at = int(max(state.head_starts_at, pruning.settled_at, state.densify_until))
+    trials = Trials(options, state, densification, begins_at)
+    train_callbacks: list[Callback] = [
         DenseStart(options, points, num_images),
         densification,
         FloaterRemoval(None if points is None else points[0]),
-        *prunes,
+        trials,  # also where options decide: a run that is resumed may have been in one
+        ScheduledPruning(pruning, evaluate=options.evaluate_prune),
+        AfterPrune(trials),
         ExposureCompensation(num_images, options.exposure_compensation),
     ]
     if options.average_share > 0:

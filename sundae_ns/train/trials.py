@@ -54,6 +54,7 @@ from sundae_ns.train.state import HEAD, Callback, TrainingRun, TrainingState
 
 _log = logging.getLogger(__name__)
 
+COUNTS = ("count", "tenth")  # Stages that decide the number of Gaussians
 SHARES: tuple[float, ...] = (1.0, 0.4, 0.2, 0.1, 0.05, 0.025)  # Of the Gaussians that are tried
 COUNT_SHARE = 0.02  # Length of a trial of a count, and of a window of a length, as a share of the schedule
 FEWEST_VIEWS = 6  # Fewer cannot judge a head
@@ -227,9 +228,8 @@ class Trials(Callback):
         self.coming = dict(engine["coming"])
         self._mean = RunningMean.of(engine, state.device)
         self._apply(state)
-        needed = ["start"] if progress.stage in ("count", "tenth", "head", "length") else []
-        if progress.stage == "head":
-            needed += [row.head for row in progress.of("head")]
+        needed = ["start"] if progress.stage in (*COUNTS, "head", "length") else []
+        needed += [row.head for row in tried if row.stage == progress.stage == "head"]
         if not all(isinstance(kept := self.kept.get(name), Mapping) and "head" not in kept for name in needed):
             raise CheckpointError("the checkpoint lacks a field that its trials would return to; give another")
 
@@ -241,12 +241,16 @@ class Trials(Callback):
         """Hold views out; decide at once where trials cannot."""
         progress, state = self.progress, run.state
         indices = run.view_indices()
-        state.pruning[VIEWS] = num_views = len(indices)
+        num_views, before = len(indices), state.pruning.get(VIEWS)
+        state.pruning[VIEWS] = num_views
         # A warm start skips the steps before the prune.
         progress.steps = progress.steps or (run.schedule_length or 0) + state.offset
         self._window = max(round(COUNT_SHARE * progress.steps), 1)
         self._folds, self._length = choice.plan_heads(indices, progress.steps)
         self._judges = choice.spread_cameras(indices, min(choice.MOST_HELD_OUT, num_views // choice.HELD_OUT_EVERY), 0)
+        for stages, decides in ((COUNTS, self.config.decides), (("head", "length"), self.decides_head)):
+            if not decides or num_views != before:
+                self._forget(run, stages)
         if self.config.decides and "count" not in progress.chosen:
             self._prepare_counts(run, num_views)
         if self.decides_head and "head" not in progress.chosen:
@@ -255,6 +259,16 @@ class Trials(Callback):
             self._end_length(run, "", None)  # a length counts steps of one image
         self.hold_out(run)
         self._record(run)
+
+    def _forget(self, run: TrainingRun, stages: tuple[str, str]) -> None:
+        """Undo what has begun, as a resumed run may have other views, or options that leave nothing to decide."""
+        self.coming.pop(stages[0], None)
+        if self.progress.stage in stages:
+            self.go_back("start", run.state)
+            self.progress.stage = ""
+            self.progress.tried = [row for row in self.progress.tried if row.stage not in stages]
+            self.end(run, stages[0])
+            self.enable_head(run.state, not self.decides_head)
 
     def _prepare_counts(self, run: TrainingRun, num_views: int) -> None:
         """Hold views out for trials of counts, or keep the usual share where there can be none."""
@@ -271,8 +285,7 @@ class Trials(Callback):
         if state.pruning["num_prunes"] and not progress.stage:  # by a share that was given
             progress.chosen["count"] = 0
         elif reason is not None:
-            if progress.stage:  # one GPU has begun them, and has pruned for a trial
-                self.go_back("start", state)
+            self._forget(run, COUNTS)  # one GPU may have begun them, and have pruned for a trial
             self._keep_usual(run, reason)
         else:
             self.coming["count"] = self._judges
@@ -295,7 +308,7 @@ class Trials(Callback):
     def after_step(self, run: TrainingRun) -> None:
         """Try counts, before the schedule prunes."""
         progress = self.progress
-        if progress.stage in ("count", "tenth"):
+        if progress.stage in COUNTS:
             self._go_on(run)
         elif self.config.decides and "count" not in progress.chosen and run.state.schedule_step >= self.config.prune_at:
             self._begin_counts(run)
@@ -303,7 +316,7 @@ class Trials(Callback):
     def after_prune(self, run: TrainingRun) -> None:
         """Try heads and lengths, once the schedule has pruned."""
         progress, state, coming = self.progress, run.state, self.coming
-        if not self.decides_head or progress.stage in ("count", "tenth", "paused"):
+        if not self.decides_head or progress.stage in (*COUNTS, "paused"):
             return
         if progress.stage:
             self._go_on(run)
@@ -413,10 +426,9 @@ class Trials(Callback):
         head = next(head for head in self._heads if self._widths[head] == width)
         row = Tried(stage, run.source.total, head, self.trial.length, [list(view) for view in self.measure(run)])
         progress.tried.append(row)
-        if stage in ("count", "tenth"):
+        if stage in COUNTS:
             row.bytes = packed_size(state.gaussians, enabled)
             self.go_back("start", state)
-            self.enable_head(state, False)
             self._try_count(run)
         elif stage == "head":
             params = {name: value for name, value in state.gaussians.items() if enabled is not None or name != FEATURES}
@@ -441,7 +453,6 @@ class Trials(Callback):
         self._densification.initialize(state)  # its statistics would not match the Gaussians that come back
         self.progress.full = run.source.total
         self._announce(run, "how many Gaussians does the scene need?", len(SHARES), self._window, self._judges)
-        self.enable_head(state, False)
         self.keep("start", state, head=self.decides_head and state.head is not None)
         self._try_count(run)
 
@@ -512,8 +523,7 @@ class Trials(Callback):
         self.progress.stage = ""
         self.progress.chosen["count"] = run.state.pruning[COUNT] = count
         self.end(run, "count")
-        if not self.decides_head:
-            self.enable_head(run.state, True)
+        self.enable_head(run.state, not self.decides_head)
 
     def _heads_fit(self, run: TrainingRun) -> bool:
         """Whether the chosen candidate can train on for the length of a trial."""

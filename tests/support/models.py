@@ -64,8 +64,8 @@ class FakeDatamanager:
     place = (0, 1)
     held_out_indices = ()
     train_indices = (0, 1, 2)
-
     mask = None  # Of each view
+    hold_out = list  # Called with indices
 
     def cameras(self, indices):
         yield from ((_camera(shift=(-0.5, 0.0, 0.5)[index]), _batch()) for index in indices)

@@ -17,7 +17,7 @@ from sundae_ns.head.head import CompensationHead, HeadConfig
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
 from sundae_ns.train import trials as trials_module
 from sundae_ns.train.choice import HeldOutQuality, Tried
-from sundae_ns.train.pruning import COUNT, MANY_VIEWS, NEVER, PruningConfig
+from sundae_ns.train.pruning import COUNT, NEVER, VIEWS, PruningConfig
 from sundae_ns.train.schedules import Decay
 from sundae_ns.train.trials import Progress, Trial, Trials, packed_size
 
@@ -46,8 +46,8 @@ class FakeRun:
         return most
 
 
-def trials_for(state, begins_at=-math.inf, mode="auto"):
-    head, pruning = SimpleNamespace(mode=mode), PruningConfig(keep_ratio=None)
+def trials_for(state, begins_at=-math.inf, mode="auto", keep_ratio=None):
+    head, pruning = SimpleNamespace(mode=mode), PruningConfig(keep_ratio=keep_ratio)
     return Trials(SimpleNamespace(pruning=pruning, head=head, ssim_lambda=0.2), state, None, begins_at)
 
 
@@ -157,31 +157,49 @@ def test_a_state_in_the_middle_of_a_trial_is_resumed(run, monkeypatch):
     assert (height(run), other.taken_back) == (0.0, 6)
 
 
-def test_several_gpus_prune_the_field_from_which_counts_were_tried(run):
+@pytest.mark.parametrize(
+    ("stage", "views", "images", "given", "held_out"),
+    [
+        ("count", 40, 1, {"keep_ratio": 0.1}, []),
+        ("count", 40, 2, {}, []),  # on several GPUs
+        ("tenth", 33, 1, {}, [0, 8, 16, 24]),
+        ("head", 40, 1, {"keep_ratio": 0.1, "mode": "residual"}, []),
+        ("head", 39, 1, {"keep_ratio": 0.1}, []),
+    ],
+)
+def test_a_resumed_run_forgets_what_it_does_not_try_any_more(run, stage, views, images, given, held_out):
+    """It would hold views out to the end, keep the field of a trial, or compare views that are not the same."""
     trials, state = trials_for(run.state), run.state
-    trials.keep("start", state, head=False)
-    trials.start(run, "count", 5, [], width=0)
+    state.pruning[VIEWS] = 40
+    trials.coming = {"head" if stage == "head" else "count": [1, 3]}
+    for name in ("start", "plain"):
+        trials.keep(name, state, head=False)
+    trials.start(run, stage, 5, [1, 3], width=0)
+    trials.progress.tried.append(Tried(stage, 20, "plain", 5, [[*VIEW]]))
     run.train(trials, most=2)
     state.pruning.update(pruned_at=0, num_prunes=1)
-    run.view_indices, run.folder = lambda: [*range(MANY_VIEWS)], None
-    run.images_per_step, run.last_step, run.schedule_length = 2, 99, 100
-    trials.before_training(run)
-    assert (height(run), state.pruning["pruned_at"], state.pruning[COUNT]) == (0.0, NEVER, 0)
+    state.head_starts_at = 1
+    resumed = trials_for(state, **given)
+    resumed.load_state_dict(state, trials.state_dict())
+    run.view_indices, run.folder = lambda: [*range(views)], None
+    run.images_per_step, run.last_step, run.schedule_length = images, 29999, 30000
+    resumed.before_training(run)
+    assert (height(run), run.held_out) == (0.0, held_out)
+    assert (resumed.progress.stage, resumed.progress.tried, resumed.trial) == ("", [], None)
+    assert (state.pruning["pruned_at"], state.pruning.get(COUNT)) == (NEVER, 0 if images > 1 else None)
+    assert state.head_enabled == (images > 1 or "mode" in given)
     state.head_starts_at = 1
     trials_for(state, begins_at=9, mode="residual").before_training(run)
     assert state.head_starts_at == 1, "as where the run is resumed"
 
 
-def test_trials_are_there_for_an_undecided_head_which_is_disabled_or_an_undecided_count(build):
+def test_an_undecided_head_is_disabled_and_trials_act_on_both_sides_of_the_prune(build):
     model = build(head={"mode": "auto"})
     model.step = 10**6
     assert model.head.config.mode == "residual"
     assert not model.state.head_enabled
-    for mode in ("residual", "features", "off"):
-        assert "trials" not in {callback.name for callback in build(head={"mode": mode}).train_callbacks}
-    for undecided in (model, build(head={"mode": "off"}, pruning={"keep_ratio": None})):
-        names = [callback.name for callback in undecided.train_callbacks]
-        assert names.index("trials") < names.index("pruning") < names.index("after-prune")
+    names = [callback.name for callback in model.train_callbacks]
+    assert names.index("trials") < names.index("pruning") < names.index("after-prune")
 
 
 def test_a_removed_head_leaves_no_values_and_no_moments(build):
