@@ -24,9 +24,10 @@ def select_band(magnitude: Tensor, count: int, gamma: float) -> Tensor:
     """
     values = magnitude.detach().cpu().double()
     mask = torch.zeros(len(values), dtype=torch.bool)
-    mask[_ranked(values)[: round(gamma * count)]] = True
+    # Both sorts ascend, so that NaN, which torch takes for the largest number, comes last in both.
+    mask[torch.sort(-values, stable=True).indices[: round(gamma * count)]] = True
     others = (~mask).nonzero().squeeze(1)
-    mask[others[_ranked(-values[others])][: count - int(mask.sum())]] = True
+    mask[others[torch.sort(values[others], stable=True).indices][: count - int(mask.sum())]] = True
     return mask.to(magnitude.device)
 
 
@@ -90,12 +91,3 @@ def _systematic_sample(probabilities: Tensor, count: int, start: float) -> Tenso
     drawn = torch.searchsorted(sums, marks, right=True).minimum(steps + len(uncertain) - wanted)
     drawn = (drawn - steps).cummax(0).values + steps
     return torch.cat([taken, uncertain[drawn]])
-
-
-def _ranked(values: Tensor) -> Tensor:
-    """Indices by falling value, lower index first among equals, NaN after everything else."""
-    unknown = values.isnan()
-    order = torch.sort(values.masked_fill(unknown, -torch.inf), descending=True, stable=True).indices
-    # -inf and NaN tie in the sort, so a second stable pass moves NaN to the end.
-    late = unknown[order]
-    return torch.cat([order[~late], order[late]])

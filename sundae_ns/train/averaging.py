@@ -109,8 +109,7 @@ class Averaging(Callback):
             end = max(last, length - 1)  # a part that ends earlier ends with its own weights
             state.averages_from = max(end - self.share * length, self.settled_at - state.offset)
         self._alone = run.images_per_step == 1
-        if self._alone:
-            RunningMean(self._replaced, 1).replace(weights_of(state))
+        RunningMean(self._replaced, 1).replace(weights_of(state))
         self._replaced = {}
 
     def after_step(self, run: TrainingRun) -> None:

@@ -129,10 +129,8 @@ class HeadGain(NamedTuple):
         """The gain between two trials that differ by the head."""
         (psnr, ssim), (better, closer) = (mean_quality(row.qualities) for row in (plain, head))
         rise = 10 * math.log10((1 - ssim) / (1 - closer)) if ssim != closer and max(ssim, closer) < 1 else None
-        gain = cls(plain.count, better - psnr, closer - ssim, rise)
-        if plain.bytes and head.bytes:
-            gain = gain._replace(features=head.bytes[0] - plain.bytes[0], head=head.bytes[1])
-        return gain
+        sizes = (head.bytes[0] - plain.bytes[0], head.bytes[1]) if plain.bytes and head.bytes else ()
+        return cls(plain.count, better - psnr, closer - ssim, rise, *sizes)
 
     def falls_by(self, count: int, power: float) -> float:
         """Factor of the gain at another count; below that of the trials it is not known to rise."""
@@ -263,11 +261,8 @@ def affordable(curve: Sequence[CurvePoint], most: int) -> int | None:
     if not (sizes := {math.log(point.count): math.log(point.bytes) for point in curve if point.bytes}):
         return None
     x, y = [*sizes], [*sizes.values()]
-    size = math.log(max(most, 1))
-    if len(sizes) == 1:
-        return max(int(math.exp(x[0] + size - y[0])), 1)
-    slope, start = np.polyfit(x, y, 1)
-    return max(int(math.exp((size - start) / max(slope, 0.1))), 1)
+    slope, start = np.polyfit(x, y, 1) if len(sizes) > 1 else (1.0, y[0] - x[0])
+    return max(int(math.exp((math.log(max(most, 1)) - start) / max(slope, 0.1))), 1)
 
 
 def loss_of(views: Sequence[HeldOutQuality], ssim_weight: float) -> float:

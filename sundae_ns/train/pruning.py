@@ -249,9 +249,8 @@ class ScheduledPruning(Callback):
             # Do not lose the warm-up to an option that can be corrected: a resumed run prunes at its first step.
             run.save()
             raise
-        settled = state.schedule_step >= config.settled_at
-        if settled or (config.mode == "one-shot" and state.pruning["num_prunes"] > 0):
-            with_head = settled and state.schedule_step >= state.head_starts_at
+        if state.schedule_step >= config.settled_at:
+            with_head = state.schedule_step >= state.head_starts_at
             notify_pruned(state.schedulers, state.step, run.source.total, last=with_head)
         if report is None:
             return

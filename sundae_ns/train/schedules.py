@@ -115,16 +115,12 @@ def notify_pruned(
             _apply(scheduler)
 
 
-Restarts = dict[str, tuple[int | None, float, int | None]]
-"""By name: the step at which a decay has restarted, its factor since, and the step at which it ends."""
-
-
-def restarts(schedulers: Mapping[str, LRScheduler]) -> Restarts:
-    """The restarts of every :class:`Decay`; plain values, for checkpoints."""
+def restarts(schedulers: Mapping[str, LRScheduler]) -> dict[str, tuple[int | None, float, int | None]]:
+    """By name the step at which a :class:`Decay` has restarted, its factor since, and the step at which it ends."""
     return {name: (decay.pruned_at, decay.after_prune, decay.ends_at) for name, _, decay in _decays(schedulers)}
 
 
-def put_restarts(schedulers: Mapping[str, LRScheduler], saved: Restarts, later: int) -> None:
+def put_restarts(schedulers: Mapping[str, LRScheduler], saved: Mapping[str, Any], later: int) -> None:
     """Put back the :func:`restarts`, this many steps later, as for a trial that starts again."""
     for name, scheduler, decay in _decays(schedulers):
         at, decay.after_prune, decay.ends_at = saved[name]

@@ -46,22 +46,6 @@ def run(config, made, steps, state=None):
     return [report for report in reports if report is not None], state
 
 
-def test_one_shot_prunes_once_and_training_goes_on():
-    made, losses = gaussians(), []
-    config, state = PruningConfig(prune_at=3, keep_ratio=0.25), dict(UNPRUNED)
-    for step in range(8):
-        reports, state = run(config, made, range(step, step + 1), state)
-        assert bool(reports) == (step == 3)
-        if step > 3:
-            losses.append(prunes.train(*made))
-        if reports:
-            assert tuple(reports[0][name] for name in ("before", "after", "peak")) == (100, 25, 100)
-            assert reports[0]["sigma"] is not None
-    assert losses == sorted(losses, reverse=True)
-    assert {len(value) for value in made[0].values()} == {25}
-    assert made[1]["means"].state[made[0]["means"]]["exp_avg"].shape == (25, 3)
-
-
 @pytest.mark.parametrize(("cap", "kept"), [(None, [70, 49, 34]), (70, [70, 49, 34]), (60, [60, 42, 29])])
 def test_continuous_keeps_a_share_on_schedule(cap, kept):
     options = {"start": 2, "every": 3, "stop": 9, "keep_ratio": 0.7, "num_neighbors": 4}

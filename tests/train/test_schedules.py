@@ -147,7 +147,6 @@ def test_options_that_a_checkpoint_cannot_follow_are_refused(name):
         ),
         ("sundae-tiny", {}, {"head": "after 600"}),
         ("sundae-continuous", {}, {"prune": "2,000 to 15,000, every 2,000"}),
-        ("sundae", {}, {"prune": "after 12,000, to as many as trials choose"}),
     ],
 )
 def test_tables_of_other_kinds(method, changed, expected):
