@@ -7,6 +7,7 @@ Every footprint is blurred by 0.3 square pixels.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from math import pi, sqrt
@@ -40,12 +41,7 @@ class ReferenceBackend:
 
     def rasterize(self, inputs: Inputs) -> Rasterization:
         """Render one view."""
-        projection = project(inputs)
-        opacities, colors = blended_values(inputs, projection)
-        means2d = projection.means2d[None]
-        size = inputs.camera.width, inputs.camera.height
-        image, alpha = composite(means2d, projection, opacities, colors, size, absgrad=inputs.absgrad)
-        return result_of(image, alpha, means2d, projection.radii, inputs)
+        return blended(inputs, project(inputs), composite)
 
     def spherical_harmonics(self, degree: int, directions: Tensor, first: Tensor, rest: Tensor) -> Tensor:
         """See :meth:`.Backend.spherical_harmonics`."""
@@ -116,15 +112,18 @@ def _limit_slope(slope: Tensor, focal: Tensor, centre: Tensor, size: int) -> Ten
     return torch.clamp(slope, min=-centre / focal - margin, max=(size - centre) / focal + margin)
 
 
-def blended_values(inputs: Inputs, projection: Projection) -> tuple[Tensor, Tensor]:
-    """Opacities ``[N]`` and channels ``[N, C]`` to blend: compensated if antialiased, with camera z if requested."""
-    opacities = inputs.opacities * projection.compensations if inputs.antialiased else inputs.opacities
-    if not inputs.render_depth:
-        return opacities, inputs.colors
-    return opacities, torch.cat([inputs.colors, projection.depths[:, None]], dim=-1)
-
-
 # ------------------------------------------------------------------------------------------------------------ blending
+
+
+def blended(inputs: Inputs, projection: Projection, composite: Callable[..., tuple[Tensor, Tensor]]) -> Rasterization:
+    """The result of a view, of what a backend has projected and its function as :func:`composite`."""
+    opacities = inputs.opacities * projection.compensations if inputs.antialiased else inputs.opacities
+    colors = inputs.colors
+    if inputs.render_depth:
+        colors = torch.cat([colors, projection.depths[:, None]], dim=1)
+    means2d, size = projection.means2d[None], (inputs.camera.width, inputs.camera.height)
+    image, alpha = composite(means2d, projection, opacities, colors, size, absgrad=inputs.absgrad)
+    return result_of(image, alpha, means2d, projection.radii, inputs)
 
 
 def composite(

@@ -19,8 +19,7 @@ from splat_inputs import blending_weights, geometry, rasterize, rasterize_camera
 from torch import Tensor
 
 from sundae_ns.core.errors import BackendError
-from sundae_ns.rasterize.cpu import backend as cpu_backend
-from sundae_ns.rasterize.cpu import parallel, tiles
+from sundae_ns.rasterize.cpu import compositing, parallel, tiles
 from sundae_ns.rasterize.gsplat_backend import RecordableGsplat
 from sundae_ns.rasterize.gsplat_kernels import Capacity
 from sundae_ns.rasterize.interface import harmonic_colors, select_backend
@@ -455,7 +454,7 @@ def test_an_image_of_many_pairs_is_blended_by_regions(monkeypatch):
 
     once = render(values, camera, F32, CPU)
     monkeypatch.setattr(tiles, "MOST_PAIRS", 400)
-    monkeypatch.setattr(cpu_backend, "tile_lists", limited)
+    monkeypatch.setattr(compositing, "tile_lists", limited)
     compare(render(values, camera, F32, CPU), once, 0.0, 1e-5)
     half = len(regions) // 2
     assert len(regions) == 2 * half >= 10  # the backward pass makes them again

@@ -6,7 +6,6 @@ harmonics. Their loops compute in float64, which costs little next to the blendi
 
 from __future__ import annotations
 
-from functools import partial
 from math import pi, sqrt
 from typing import Any, cast
 
@@ -18,9 +17,9 @@ from torch.autograd.function import once_differentiable
 from sundae_ns.rasterize import reference
 from sundae_ns.rasterize.cpu.compositing import composite
 from sundae_ns.rasterize.cpu.parallel import as_array, borrowing, compiled, inlined, parallel_for
-from sundae_ns.rasterize.cpu.tiles import MIN_PER_THREAD, tile_lists
-from sundae_ns.rasterize.reference import BLUR, FOV_MARGIN, MAX_RADIUS, Projection, blended_values
-from sundae_ns.rasterize.types import Inputs, Rasterization, result_of
+from sundae_ns.rasterize.cpu.tiles import MIN_PER_THREAD
+from sundae_ns.rasterize.reference import BLUR, FOV_MARGIN, MAX_RADIUS, Projection, blended
+from sundae_ns.rasterize.types import Inputs, Rasterization
 
 _SHORTEST = 1e-12  # lower bound of a vector's divisor, as in torch's normalize()
 _TERMS = 25  # harmonics of degree 4
@@ -35,13 +34,7 @@ class CpuBackend:
 
     def rasterize(self, inputs: Inputs) -> Rasterization:
         """Render one view."""
-        projection = project(inputs)
-        opacities, colors = blended_values(inputs, projection)
-        means2d = projection.means2d[None]
-        size = inputs.camera.width, inputs.camera.height
-        lists = partial(tile_lists, projection, opacities, *size)
-        image, alpha = composite(means2d, projection.conics, opacities, colors, size, lists, inputs.absgrad)
-        return result_of(image, alpha, means2d, projection.radii, inputs)
+        return blended(inputs, project(inputs), composite)
 
     def spherical_harmonics(self, degree: int, directions: Tensor, first: Tensor, rest: Tensor) -> Tensor:
         """See :meth:`.Backend.spherical_harmonics`."""

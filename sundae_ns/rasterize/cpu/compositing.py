@@ -14,7 +14,8 @@ blended entry of each pixel tells which entries were blended.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any
+from functools import partial
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -36,8 +37,8 @@ from sundae_ns.rasterize.cpu.lanes import (
     zeros,
 )
 from sundae_ns.rasterize.cpu.parallel import as_array, compiled, inlined, parallel_for
-from sundae_ns.rasterize.cpu.tiles import HALF_XX, HALF_YY, MIN_PER_THREAD, OPACITY, TILE, XY, Lists, U, V
-from sundae_ns.rasterize.reference import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+from sundae_ns.rasterize.cpu.tiles import HALF_XX, HALF_YY, MIN_PER_THREAD, OPACITY, TILE, XY, Lists, U, V, tile_lists
+from sundae_ns.rasterize.reference import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, Projection
 
 _PIXELS = TILE * TILE
 _CHECK_EVERY = 8  # list entries between two checks for opaque tiles
@@ -100,13 +101,13 @@ class _Composite(torch.autograd.Function):
         return *map(torch.from_numpy, outputs), None, None, None
 
 
-composite = _Composite.apply
-"""Blend to an image ``[H, W, C]`` and its alpha ``[H, W, 1]``; once differentiable.
-
-It takes centres ``[1, N, 2]`` in pixels, conics ``[N, 3]``, opacities ``[N]`` and colours ``[N, C]``, for their
-gradients; width and height; a function that gives the lists of each region, which hold the geometry that is read; and
-``absgrad``: the backward pass sets that of the centres, as :func:`sundae_ns.rasterize.reference.composite` does.
-"""
+def composite(
+    means2d: Tensor, projection: Projection, opacities: Tensor, colors: Tensor, size: tuple[int, int], *, absgrad: bool
+) -> tuple[Tensor, Tensor]:
+    """As :func:`sundae_ns.rasterize.reference.composite`, once differentiable."""
+    splats = means2d, projection.conics, opacities, colors
+    lists = partial(tile_lists, projection, opacities, *size)
+    return cast("tuple[Tensor, Tensor]", _Composite.apply(*splats, size, lists, absgrad))
 
 
 @inlined
