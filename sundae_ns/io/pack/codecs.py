@@ -24,7 +24,7 @@ from sundae_ns.core.errors import PackError
 from sundae_ns.core.gaussians import FEATURES, SPLAT_NAMES
 from sundae_ns.io.coordinates import interleave, scene_order, separate
 from sundae_ns.io.pack.config import STEPS, PackConfig
-from sundae_ns.io.pack.container import Array, Coded, Floats, Levels
+from sundae_ns.io.pack.container import Array, Coded, Floats
 from sundae_ns.io.pack.entropy import LARGEST
 
 _UNIT = 127  # a basis is stored in these parts of a step
@@ -181,7 +181,7 @@ class Transform:
 
     def rounded(self, values: Tensor) -> Tensor:
         """Return the rows that a reader decodes; bit for bit on a CPU, up to rounding elsewhere."""
-        return _expand(self._levels(values), self.mean, self.basis, self.step)
+        return rows_at(self._levels(values), self.mean, self.basis, self.step)
 
     def coefficients(self, rows: Tensor) -> Tensor:
         """Coefficients in steps, float64 ``[N, D]``; gradients flow through them."""
@@ -233,14 +233,8 @@ def _roots(size: int, form: Tensor | None) -> tuple[NDArray[np.float64], NDArray
     return vectors * roots @ vectors.T, vectors / roots @ vectors.T
 
 
-def rows_at(levels: Levels, mean: Floats, basis: NDArray[np.int8], step: float) -> Floats:
-    """Rows ``[N, D]`` from levels ``[N, D]`` and the arrays of :meth:`Transform.encode`, with a basis ``[D, D]``."""
-    # Copies, because arrays of a file are read-only.
-    return _expand(torch.tensor(levels), torch.tensor(mean), torch.tensor(basis), step).numpy()
-
-
-def _expand(levels: Tensor, mean: Tensor, basis: Tensor, step: float) -> Tensor:
-    """Rows ``[N, D]``, float32, of levels ``[N, D]``, for a basis in 127ths of the step ``[D, D]``."""
+def rows_at(levels: Tensor, mean: Tensor, basis: Tensor, step: float) -> Tensor:
+    """Rows ``[N, D]``, float32, of levels ``[N, D]`` of a :class:`Transform` with this mean, basis and step."""
     out = torch.empty(levels.shape, device=levels.device)
     scaled = basis.float() * float(np.float32(step / _UNIT))
     for start in range(0, len(levels), _CHUNK):

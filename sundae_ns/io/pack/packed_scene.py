@@ -24,7 +24,7 @@ from sundae_ns.io.budget import afford
 from sundae_ns.io.pack import container, entropy
 from sundae_ns.io.pack.codecs import Blocks, Codecs, Sensitivity, as_matrix, fit_codecs, quats_at, rows_at, weights_at
 from sundae_ns.io.pack.config import PackConfig
-from sundae_ns.io.pack.container import FORMAT, MAX_RATIO, SPARE, Array, Coded, Levels, fault, fits, in_range
+from sundae_ns.io.pack.container import FORMAT, MAX_RATIO, SPARE, Array, Coded, fault, fits, in_range
 from sundae_ns.io.ply import check_gaussians
 
 CAMERAS: dict[str, dict[str, Any]] = FORMAT["sections"]["cameras"]
@@ -221,17 +221,14 @@ def _decoded(file: _Sections, n: int, width: int, features: int) -> PackedScene:
     bits, size = (int(_about(file, "means")[key]) for key in ("bits", "block"))
     low, high = (_array(file, "means", end, blocks=-(-n // size)) for end in ("low", "high"))
 
-    def levels(name: str, channels: int) -> tuple[Levels, float]:
-        return entropy.decode_levels(_array(file, name, "levels"), channels, near), float(_about(file, name)["step"])
+    def levels(name: str, channels: int) -> tuple[Tensor, float]:
+        coded = entropy.decode_levels(_array(file, name, "levels"), channels, near)
+        return torch.from_numpy(coded), float(_about(file, name)["step"])
 
-    def quats() -> Array:
-        coded, step = levels("quats", 3)
-        return np.asarray(quats_at(torch.from_numpy(coded), step).numpy())
-
-    def rows(name: str, channels: int) -> Array:
+    def rows(name: str, channels: int) -> Tensor:
         coded, step = levels(name, channels)
-        mean = _array(file, name, "mean", width=channels)
-        return rows_at(coded, mean, _array(file, name, "basis", square=channels**2).reshape(channels, channels), step)
+        mean, basis = _array(file, name, "mean", width=channels), _array(file, name, "basis", square=channels**2)
+        return rows_at(coded, torch.tensor(mean), torch.tensor(basis).reshape(channels, channels), step)
 
     with ThreadPoolExecutor(2) as pool:
         # A head needs no positions. Then the largest jobs come first, so that the threads end together.
@@ -240,10 +237,10 @@ def _decoded(file: _Sections, n: int, width: int, features: int) -> PackedScene:
         near = entropy.neighbours_of(blocks.cells, size)
         wide, narrow = {"features_rest": width, FEATURES: features}, {"scales": 3, "features_dc": 3, "opacities": 1}
         jobs = {name: pool.submit(rows, name, channels) for name, channels in wide.items() if channels}
-        jobs["quats"] = pool.submit(quats)
+        jobs["quats"] = pool.submit(lambda: quats_at(*levels("quats", 3)))
         jobs |= {name: pool.submit(rows, name, channels) for name, channels in narrow.items()}
-        jobs["means"] = pool.submit(blocks.positions, bits, size)
-        gaussians = {name: torch.from_numpy(job.result()) for name, job in jobs.items()}
+        jobs["means"] = pool.submit(lambda: torch.from_numpy(blocks.positions(bits, size)))
+        gaussians = {name: job.result() for name, job in jobs.items()}
     gaussians["features_rest"] = gaussians.get("features_rest", torch.zeros(0)).reshape(n, width // 3, 3)
     ordered = {name: gaussians[name] for name in (*SPLAT_NAMES, FEATURES) if name in gaussians}
     meta = {name: value for name, value in file.meta.items() if name not in ("sections", "attributes", "primitives")}

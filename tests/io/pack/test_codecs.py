@@ -132,8 +132,8 @@ def test_transform(kind, n, seed):
     codec = module.fit_transform(x, 0.03)
     for values in (drifted(x, seed), x):  # rounding is what a reader decodes, bit for bit
         _, levels, arrays = codec.encode(values)
-        arrays["basis"] = arrays["basis"].reshape(9, 9)
-        found = module.rows_at(levels, step=codec.step, **arrays).astype(np.float64)
+        mean, basis = (torch.from_numpy(arrays[name]) for name in ("mean", "basis"))
+        found = module.rows_at(torch.from_numpy(levels), mean, basis.reshape(9, 9), codec.step).double().numpy()
         assert np.array_equal(codec.rounded(torch.from_numpy(values)).numpy(), found)
         assert np.abs(levels).max() <= entropy.LARGEST
     # Sums of nine products in float32.
