@@ -26,7 +26,6 @@ from sundae_ns.rasterize.cpu.lanes import (
     WIDTH,
     absolute,
     any_lane,
-    broadcast,
     exp_negative,
     fma,
     load,
@@ -160,7 +159,7 @@ def _blend(
                 store(summed, p, load(summed, p) + weights)
                 for c in range(channels):
                     at = p * channels + c * WIDTH
-                    store(blended, at, fma(weights, broadcast(row, _COLORS + c), load(blended, at)))
+                    store(blended, at, fma(weights, row[_COLORS + c], load(blended, at)))
             if nth % _CHECK_EVERY == 0 and not _any_unfinished(through):
                 break
         through[:] = np.abs(through)
@@ -269,9 +268,9 @@ def _product(grads: Any, at: int, row: Any, channels: int) -> Any:
     """<g, c> of WIDTH pixels; two sums, whose latencies overlap."""
     even = odd = zeros(grads)
     for c in range(0, channels, 2):
-        even = fma(load(grads, at + c * WIDTH), broadcast(row, _COLORS + c), even)
+        even = fma(load(grads, at + c * WIDTH), row[_COLORS + c], even)
         if c + 1 < channels:
-            odd = fma(load(grads, at + c * WIDTH + WIDTH), broadcast(row, _COLORS + c + 1), odd)
+            odd = fma(load(grads, at + c * WIDTH + WIDTH), row[_COLORS + c + 1], odd)
     return even + odd
 
 

@@ -172,24 +172,11 @@ def load(typing: Any, array: Any, index: Any) -> Any:
 
 
 @_intrinsic
-def broadcast(typing: Any, array: Any, index: Any) -> Any:
-    """Load one element of a C-contiguous array, at flat ``index``, into all lanes."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        data = arrayobj.make_array(array)(context, builder, arguments[0]).data
-        number = builder.load(builder.gep(data, [arguments[1]]))
-        return _broadcast(context, builder, number, array.dtype, signature.return_type)
-
-    return Lanes(array.dtype)(array, types.intp), generate
-
-
-@_intrinsic
 def store(typing: Any, array: Any, index: Any, values: Any) -> Any:
-    """Store lanes where :func:`load` would read them; a scalar is stored in all."""
+    """Store lanes where :func:`load` would read them."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        lanes = _broadcast(context, builder, arguments[2], values, Lanes(array.dtype))
-        builder.store(lanes, _address(context, builder, array, *arguments[:2]), align=array.dtype.bitwidth // 8)
+        builder.store(arguments[2], _address(context, builder, array, *arguments[:2]), align=array.dtype.bitwidth // 8)
         return context.get_dummy_value()
 
     return types.void(array, types.intp, values), generate
