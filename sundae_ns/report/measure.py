@@ -27,7 +27,7 @@ from sundae_ns.core.timing import median_ms
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.data.capture_files import TRANSFORMS, placed_in
 from sundae_ns.head.head import bytes_of_module
-from sundae_ns.scene.compose import aligned
+from sundae_ns.scene.compose import OTHERS, aligned
 from sundae_ns.scene.describe import bytes_at, held_out_cameras
 from sundae_ns.scene.frames import FrameReplay
 from sundae_ns.scene.load_save import load
@@ -61,9 +61,12 @@ class Configuration:
     views: tuple[ViewQuality, ...]  # Empty for the scene that others are compared with
 
     def mean(self, metric: str) -> float | None:
-        """Mean of a metric over the views; None unless every view has it."""
+        """Mean of a metric over the views; None unless every view has it. Equal images count as 100 dB among others."""
         values = [getattr(view, metric) for view in self.views]
-        return None if not values or any(value is None or math.isnan(value) for value in values) else fmean(values)
+        if not values or any(value is None or math.isnan(value) for value in values):
+            return None
+        equal = math.inf if min(values) == math.inf else MOST_PSNR
+        return fmean(equal if value == math.inf else value for value in values)
 
 
 @dataclass(frozen=True)
@@ -193,6 +196,8 @@ def against_photos(data: Path | None) -> Callable[[Path], Subject]:
 def against_first(path: Path, reference: Scene, cameras: Sequence[Camera]) -> Callable[[Path], Subject]:
     """A function that opens scenes in views of the scene at a path, ``reference``, whose images are the truth."""
     views = [(camera.to(reference.device), render(reference, camera).rgb) for camera in cameras]
+    if blank := sum(bool((image == reference.background).all()) for _, image in views):
+        _log.warning("%d of %d cameras see nothing of %s; %s", blank, len(views), path, OTHERS)
     middle, reach = middle_and_reach(usable(reference))
 
     def subject(other: Path) -> Subject:
@@ -267,7 +272,6 @@ def measure(
     stored = stored if subject.file_bytes is None else (subject.file_bytes, 0)
     needed = {HEAD_ON: sum(stored), HEAD_OFF: subject.file_bytes or bare}
     resolutions = list(dict.fromkeys(f"{camera.width}x{camera.height}" for camera in subject.cameras))
-    timed = bool(times["head"])
     return Measured(
         label=label,
         **subject.facts,
@@ -276,10 +280,10 @@ def measure(
         bytes_head=stored[1],
         resolution=resolutions[0] + " and others" if len(resolutions) > 1 else "".join(resolutions),
         configurations=tuple(
-            Configuration(name, median(times[name]) if timed else None, needed[name], tuple(views[name]))
+            Configuration(name, median(times[name]) if times[name] else None, needed[name], tuple(views[name]))
             for name in ways
         ),
-        ms_head=median(times["head"]) if timed else None,
+        ms_head=median(times["head"]) if times["head"] else None,
         precision="" if head is None else "fp32" if device.type == "cpu" else head.config.precision,
         lpips_net=lpips.net if lpips is not None else "",
         gpu=torch.cuda.get_device_name(device) if device.type == "cuda" else "",

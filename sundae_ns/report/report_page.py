@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
-from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
@@ -30,10 +29,8 @@ MOST_ON_A_PAGE = 32  # views of all scenes, if that leaves two for each
 LONGEST_SIDE = 1200  # of images in a page, pixels; larger ones are reduced
 EXACT_SIDE = 512  # longest side of images that are stored without loss: a browser enlarges them, and losses would show
 LARGEST_ERROR = 51  # mean difference of the channels, in levels of 255, that gets the last colour of the error map
-ERROR_COLORS: NDArray[np.uint8] = np.round(
-    255 * matplotlib.colormaps["magma"](np.linspace(0, 1, 32))[:, :3]  # readable in grey and with colour deficiency
-).astype(np.uint8)
-"""Colours of an error map ``[32, 3]``, from no error to the largest; few, because they decide its bytes."""
+ERROR_COLORS = np.round(255 * matplotlib.colormaps["magma"](np.linspace(0, 1, 32))[:, :3]).astype(np.uint8)
+"""Colours of an error map ``[32, 3]``, readable in grey and with colour deficiency; few, as they decide its bytes."""
 NAMES = {"psnr": "PSNR", "psnr_fitted": "colours fitted", "ssim": "SSIM", "lpips": "LPIPS"}
 
 
@@ -136,10 +133,11 @@ def report_page(runs: Sequence[ShownRun], notes: Sequence[str], command: str, tr
     scenes: dict[str, list[tuple[int, ShownRun]]] = {}
     for numbered in enumerate(runs):
         scenes.setdefault(numbered[1].measured.scene, []).append(numbered)
-    script = _text("page.js")
+    files = (resources.files("sundae_ns.report").joinpath(name) for name in ("page.html", "page.js"))
+    page, script = (file.read_text(encoding="utf-8") for file in files)
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {"data": Markup, "number": number}
-    return environment.from_string(_text("page.html")).render(
+    return environment.from_string(page).render(
         title=", ".join(scenes),
         command=command,
         truth=truth,
@@ -157,7 +155,3 @@ def report_page(runs: Sequence[ShownRun], notes: Sequence[str], command: str, tr
         # A browser runs no other script here, even if a file's name should ever stand unescaped.
         script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     )
-
-
-def _text(name: str) -> str:
-    return resources.files("sundae_ns.report").joinpath(name).read_text(encoding="utf-8")

@@ -51,6 +51,10 @@ def test_files_are_compared_with_the_first_one(folder, tmp_path, capsys, caplog)
     assert 'aria-hidden="true">whole.sundae</span>' in page
     assert run("compare", *words, "--cameras", folder / "whole.sundae", "--num-cameras", 1, "--min-psnr", 5) == 0
     assert "scaled" not in caplog.text
+    away = cameras[0], sn.Camera.look_at((0, 9, 0), (0, 99, 0), width=48, height=32)
+    sn.save(dataclasses.replace(scenes[0], cameras=away), tmp_path / "away.sundae")
+    assert run("compare", tmp_path / "away.sundae", words[2], "--min-psnr", 90) == 1, "an empty view proves nothing"
+    assert "1 of 2 cameras see nothing of" in caplog.text
     moves = {"1 times .* 9 away; if it was moved or scaled": {"translation": (0, 9, 0)}, "3 times": {"scale": 3}}
     for told, change in moves.items():
         sn.save(sn.transform(scenes[1], **change), tmp_path / "other.ply")

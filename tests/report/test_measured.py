@@ -34,19 +34,18 @@ def test_a_row_pairs_each_time_with_the_quality_of_its_configuration(measured):
 
 
 def test_a_mean_needs_all_views():
-    views = (ViewQuality(20.0, 0.5, 0.1), ViewQuality(22.0, 0.7, 0.3), ViewQuality(21.0, math.nan))
+    views = (ViewQuality(math.inf, 0.5, 0.1), ViewQuality(22.0, 0.7, 0.3), ViewQuality(21.0, math.nan))
     missing = ((2, "psnr_fitted"), (3, "lpips"), (3, "ssim"), (0, "psnr"))
-    for count, metric, mean in ((2, "lpips", 0.2), *((*case, None) for case in missing)):
-        found = Configuration("x", 1.0, 1, views[:count]).mean(metric)
-        assert found == (None if mean is None else pytest.approx(mean)), metric
+    known = {(2, "lpips"): 0.2, (1, "psnr"): math.inf, (2, "psnr"): 61.0}
+    for (count, metric), mean in {**known, **dict.fromkeys(missing)}.items():
+        assert Configuration("x", 1.0, 1, views[:count]).mean(metric) == pytest.approx(mean), metric
 
 
 def test_the_net_is_named_only_if_lpips_was_measured(measured):
     run = replace(measured(head=False), lpips_net="alex")
     assert row_of(run)["lpips_net"] == ""
     views = tuple(replace(view, lpips=0.3) for view in run.full.views)
-    run = replace(run, configurations=(replace(run.full, views=views),))
-    row = row_of(run)
+    row = row_of(replace(run, configurations=(replace(run.full, views=views),)))
     assert (float(row["lpips"]), row["lpips_net"]) == (pytest.approx(0.3), "alex")
 
 
