@@ -19,8 +19,6 @@ from importlib import resources
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from PIL import Image
-
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import ConfigError, MemoryExhaustedError, PackError, reading, regular
 from sundae_ns.core.files import at_home, write_files
@@ -128,20 +126,16 @@ def link_of(view: View, scene: Scene, name: str) -> str:
 
 
 def _poster(scene: Scene) -> str:
-    """Data address of the first image; of an empty one if it cannot be rendered."""
+    """Data address of the first view's image, at most 640 pixels a side; of an empty one if it cannot be rendered."""
     content = io.BytesIO()
     try:
-        render_first(scene).save(content, "jpeg", quality=80)
+        camera = opening(scene).start or scene.cameras[0]
+        image = render(scene, camera.zoomed(min(640 / max(camera.width, camera.height), 1.0))).rgb
     except MemoryExhaustedError as error:
         _log.warning("the page has no first image: %s", error)
         return "data:image/gif;base64,R0lGODlhAQABAIAAAAAAAP///yH5BAEAAAAALAAAAAABAAEAAAIBRAA7"  # a transparent pixel
+    image_of(image).save(content, "jpeg", quality=80)
     return f"data:image/jpeg;base64,{base64.b64encode(content.getvalue()).decode()}"
-
-
-def render_first(scene: Scene) -> Image.Image:
-    """The image of the start view, else of the first camera, head included, at most 640 pixels wide and high."""
-    camera = opening(scene).start or scene.cameras[0]
-    return image_of(render(scene, camera.zoomed(min(640 / max(camera.width, camera.height), 1.0))).rgb)
 
 
 @dataclass(frozen=True)

@@ -27,9 +27,7 @@ from sundae_ns.plugin.distill import distill
 from sundae_ns.scene import virtual_cameras as virtual
 from sundae_ns.scene.cameras import is_frame, opening, read_cameras, with_start
 from sundae_ns.scene.packing import start_of, stated_start
-from sundae_ns.scene.page import render_first
 from sundae_ns.scene.prune_scene import prune_with_mask
-from sundae_ns.scene.scene import image_of
 from sundae_ns.scene.virtual_cameras import front_views
 from sundae_ns.train.step import StepResolution
 
@@ -376,12 +374,6 @@ def test_files_and_scenes_made_of_a_scene_keep_both(tmp_path):
     assert same(distill(found, keep=0.5, steps=1, head=False, size=16), truth)
     assert run("prune", tmp_path / "a.sundae", "-o", tmp_path / "b.sundae") == 0
     assert same(sn.load(tmp_path / "b.sundae"), truth)
-
-
-def test_the_first_image_is_that_of_the_start_view():
-    shown = started()
-    assert np.array_equal(np.asarray(render_first(shown)), np.asarray(image_of(sn.render(shown, shown.start).rgb)))
-    assert np.asarray(render_first(two_seen())).shape == (30, 40, 3)
 
 
 @pytest.mark.parametrize("up", [None, UP, (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (-0.95, 0.3122499, 0.0)])

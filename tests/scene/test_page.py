@@ -7,6 +7,7 @@ import json
 import logging
 import re
 import subprocess
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from sundae_ns.io.pack.packed_scene import read_scene
 from sundae_ns.rasterize.reference import project
 from sundae_ns.scene import page as page_module
 from sundae_ns.scene.packing import scene_of
-from sundae_ns.scene.page import packed_of, page_of, render_first, write_page
+from sundae_ns.scene.page import packed_of, page_of, write_page
 from sundae_ns.scene.render import pass_inputs
 
 ROOT = Path(__file__).parents[2]
@@ -56,12 +57,13 @@ def test_a_page_holds_the_scene_and_no_address(packed, tmp_path):
     assert "default-src 'none'" in page
 
 
-def test_a_page_shows_the_first_camera_until_it_draws(packed):
-    (code,) = re.findall(r'src="data:image/jpeg;base64,([^"]*)"', page_of(("a", *packed_file(packed))))
-    found = np.asarray(Image.open(io.BytesIO(base64.b64decode(code))), dtype=np.float32)
-    truth = np.asarray(render_first(packed_file(packed)[0]), dtype=np.float32)
-    assert found.shape == truth.shape == (37, 50, 3)
-    assert np.abs(found - truth).mean() < 6  # JPEG
+def test_a_page_shows_its_first_view_until_it_draws(scene):
+    for shown in (scene, replace(scene, start=scene.cameras[1].zoomed(0.5))):
+        (code,) = re.findall(r'src="data:image/jpeg;base64,([^"]*)"', page_of(("a", shown, b"")))
+        found = np.asarray(Image.open(io.BytesIO(base64.b64decode(code))), dtype=np.float32)
+        truth = 255 * sn.render(shown, shown.start or shown.cameras[0]).rgb.numpy()
+        assert found.shape == truth.shape
+        assert np.abs(found - truth).mean() < 6  # JPEG
 
 
 def test_a_page_of_too_many_primitives_has_no_first_image(tmp_path, capsys, caplog):
